@@ -1,0 +1,227 @@
+#!/usr/bin/env python
+"""Measure features, matches and words against the truth, with plain OpenCV ORB as the peer in the same process.
+
+    python scripts/features.py RECORDING ... [-s extract.KEY=VALUE] [--pairs N]
+
+RECORDING as for `slamcli run`, with a true trajectory: tum/fr1_xyz, a folder, demo.
+"""
+
+import argparse
+import time
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import asdict
+
+import cv2
+import numpy as np
+from feature_truth import Recording
+from scipy.spatial import cKDTree
+
+from slamcli import config_io
+from slamcli.config import Config, MatchConfig
+from slamcli.errors import SlamError
+from slamcli.parallel import ordered_map
+from slamcli.vision import hamming, orb, vocabulary
+from slamcli.vision.comparison import evenness, plain_orb
+
+RADIUS = 3.0  # [px] within which a point is found again, or a match is correct
+CHANCE = (8.0, 16.0)  # [px] by which points are moved to tell how often one is hit by chance
+REVISIT_AFTER = 5.0  # [s] a place seen again sooner is not a loop
+KEY_FRAME_SHARED, SAME_PLACE, OTHER_PLACE = 0.8, 0.5, 0.1  # shared view: less makes a key frame; more is the same place; less is another
+ROUNDS = 5  # the fastest counts: other processes only ever add time
+
+Detector = Callable[[np.ndarray], orb.KeyPoints]
+
+
+def detector(settings: Config) -> Detector:
+    """Give our detector under these settings."""
+    options = asdict(settings.extract)
+    names = {"fast_threshold": "threshold", "fast_threshold_low": "threshold_low"}
+    return lambda grey: orb.detect(grey, **{names.get(name, name): value for name, value in options.items()})
+
+
+def cpu_ms(work: Callable[[], object], n: int) -> float:
+    """Give the CPU time of `work` on n items, of all threads, per item [ms]."""
+    best = np.inf
+    for _ in range(ROUNDS):
+        start = time.process_time()
+        work()
+        best = min(best, time.process_time() - start)
+    return best / n * 1e3
+
+
+def rate(detect: Detector, images: list[np.ndarray], workers: int) -> float:
+    """Give images per second of wall time."""
+    best = 0.0
+    for _ in range(ROUNDS):
+        start = time.perf_counter()
+        for _ in ordered_map(detect, images, workers=workers):
+            pass
+        best = max(best, len(images) / (time.perf_counter() - start))
+    return best
+
+
+def spread(recording: Recording, detect: Detector, pairs: list[tuple[int, int]]) -> dict[str, float]:
+    """Average evenness over the first frames of the pairs."""
+    found = [evenness(detect(recording.grey(i)).xy, recording.camera.width, recording.camera.height) for i, _ in pairs]
+    return {"cells hit": np.mean([f.share for f in found]), "variance / mean": np.mean([f.ratio for f in found])}
+
+
+def found_again(recording: Recording, detect: Detector, pairs: list[tuple[int, int]]) -> dict[str, float]:
+    """Average the share of visible points of i with a point of j near the true place: any; by chance; each other's nearest."""
+    rng = np.random.default_rng(0)
+    rows = []
+    for i, j in pairs:
+        here = recording.carry(detect(recording.grey(i)).xy.astype(np.float64), i, j)
+        here = here[np.isfinite(here[:, 0])]
+        there = recording.camera.undistort(detect(recording.grey(j)).xy)
+        if len(here) == 0 or len(there) == 0:
+            continue
+        distance, nearest = cKDTree(there).query(here)
+        back = cKDTree(here).query(there)[1]
+        turn, reach = rng.uniform(0, 2 * np.pi, len(here)), rng.uniform(*CHANCE, len(here))
+        moved = here + np.stack([reach * np.cos(turn), reach * np.sin(turn)], axis=1)
+        is_near = distance < RADIUS
+        rows.append(
+            [is_near.mean(), (cKDTree(there).query(moved)[0] < RADIUS).mean(), (is_near & (back[nearest] == np.arange(len(here)))).mean()]
+        )
+    any_, chance, mutual = np.mean(rows, axis=0)
+    return {"found again": any_, "by chance": chance, "beyond chance": (any_ - chance) / (1 - chance), "one to one": mutual}
+
+
+def matched(recording: Recording, detect: Detector, pairs: list[tuple[int, int]], match: Callable) -> dict[str, float]:
+    """Average the matches whose truth is known, the correct ones, and the median error of those [px]; and time the matching."""
+    frames = {k: detect(recording.grey(k)) for pair in pairs for k in pair}
+    known, correct, errors = 0, 0, []
+    for i, j in pairs:
+        rows, _ = match(frames[i], frames[j])
+        true = recording.carry(frames[i].xy.astype(np.float64), i, j)[rows[:, 0]]
+        error = np.linalg.norm(true - recording.camera.undistort(frames[j].xy)[rows[:, 1]], axis=1)
+        known += np.isfinite(error).sum()
+        correct += (error < RADIUS).sum()
+        errors.append(error[error < RADIUS])
+    ms = cpu_ms(lambda: [match(frames[i], frames[j]) for i, j in pairs], len(pairs))
+    return {"correct": correct / len(pairs), "precision": correct / max(known, 1), "median px": np.median(np.concatenate(errors)), "ms": ms}
+
+
+def brute(a: orb.KeyPoints, b: orb.KeyPoints) -> tuple[np.ndarray, np.ndarray]:
+    """Match all with all."""
+    return hamming.match_brute(a.desc, b.desc, a.angle, b.angle)
+
+
+class ByNode:
+    """Match under vocabulary nodes; words are looked up once a frame, as the pipeline does, and not timed."""
+
+    def __init__(self, words: vocabulary.Vocabulary, settings: MatchConfig) -> None:
+        self.words, self.settings, self._nodes = words, settings, {}
+
+    def nodes(self, points: orb.KeyPoints) -> np.ndarray:
+        """Give the nodes of a frame's points."""
+        if id(points) not in self._nodes:
+            level, margin = self.settings.node_level, self.settings.node_margin
+            self._nodes[id(points)] = points, vocabulary.quantise(self.words, points.desc, node_level=level, margin=margin)[1]
+        return self._nodes[id(points)][1]
+
+    def __call__(self, a: orb.KeyPoints, b: orb.KeyPoints) -> tuple[np.ndarray, np.ndarray]:
+        """Match two frames."""
+        return hamming.match_nodes(a.desc, self.nodes(a), b.desc, self.nodes(b), a.angle, b.angle)
+
+
+def recall(recording: Recording, detect: Detector, words: vocabulary.Vocabulary) -> dict[str, float]:
+    """Tell how well places seen again are recognised: queries are the key frames that truly come back to an earlier one.
+
+    Candidates are all key frames more than REVISIT_AFTER earlier, whether the place is the same or not.
+    """
+    frames = recording.key_frames(least_shared=KEY_FRAME_SHARED)
+    stamp = recording.dataset.stamp[frames]
+    vectors = [vocabulary.word_vector(vocabulary.quantise(words, detect(recording.grey(int(f))).desc)[0], words.idf) for f in frames]
+    n_queries, n_found, best = 0, 0, []
+    for k, vector in enumerate(vectors):
+        earlier = np.flatnonzero(stamp < stamp[k] - REVISIT_AFTER)
+        shared = np.array([recording.shared_view(int(frames[k]), int(frames[e])) for e in earlier])
+        index = vocabulary.InvertedIndex(words.n_words)
+        for row, e in enumerate(earlier):
+            index.add(row, *vectors[e])
+        found, score = index.query(*vector)
+        order = np.argsort(-score, kind="stable")
+        if (shared >= SAME_PLACE).any():
+            n_queries += 1
+            n_found += (shared[found[order[:5]]] >= SAME_PLACE).any()
+        if len(order):
+            best.append((score[order[0]], shared[found[order[0]]]))
+    return {
+        "key frames": len(frames),
+        "revisits": n_queries,
+        "recall in 5": n_found / max(n_queries, 1),
+        **at_full_precision(best, n_queries),
+    }
+
+
+def at_full_precision(best: list[tuple[float, float]], n_queries: int) -> dict[str, float]:
+    """Give the recall when each query's best score above a threshold is accepted, the threshold the lowest that lets no other place in.
+
+    best : score and shared view of each query's best candidate
+    """
+    wrong = max((score for score, shared in best if shared < OTHER_PLACE), default=0.0)
+    n_right = sum(score > wrong and shared >= SAME_PLACE for score, shared in best)
+    return {"recall at 100 %": n_right / max(n_queries, 1), "threshold": wrong}
+
+
+def table(title: str, rows: Iterable[tuple[str, dict[str, float]]]) -> Iterator[str]:
+    """Set figures out in lines."""
+    yield f"  {title}"
+    for name, figures in rows:
+        yield "    " + f"{name:<14}" + "  ".join(f"{key} {value:.3f}" for key, value in figures.items())
+
+
+def report(recording: Recording, settings: Config, n_pairs: int) -> Iterator[str]:
+    """Measure everything on one recording."""
+    detectors = {"OpenCV ORB": plain_orb, "slamcli": detector(settings)}
+    ours = detectors["slamcli"]
+    near, far = recording.pairs(apart=1, wanted=n_pairs), recording.pairs(apart=10, wanted=n_pairs)
+    images = [recording.grey(i) for i, _ in far]
+    yield f"{recording.dataset.name}: {len(far)} pairs of frames"
+    yield from table("evenness", ((name, spread(recording, d, far)) for name, d in detectors.items()))
+    yield from table(
+        f"repeatability, 10 frames apart, {RADIUS:g} px", ((name, found_again(recording, d, far)) for name, d in detectors.items())
+    )
+    yield from table("brute-force matches, 10 frames apart", ((name, matched(recording, d, far, brute)) for name, d in detectors.items()))
+    bare = orb_bare()
+    times = {"OpenCV ORB": bare, "slamcli": ours}
+    yield from table(
+        "CPU time", ((name, {"ms a frame": cpu_ms(lambda d=d: [d(g) for g in images], len(images))}) for name, d in times.items())
+    )
+    one, two = rate(ours, images, 1), rate(ours, images, 2)
+    yield from table("threads", [("slamcli", {"frames/s with 1": one, "with 2": two, "factor": two / one})])
+    words = vocabulary.load(settings.match.vocabulary)
+    by_node = ByNode(words, settings.match)
+    for apart, pairs in ((1, near), (10, far)):
+        methods = (("brute", brute), ("words", by_node))
+        yield from table(f"matching, {apart} apart", ((name, matched(recording, ours, pairs, m)) for name, m in methods))
+    yield from table(f"places seen again, {words.n_words} words", [("slamcli", recall(recording, ours, words))])
+
+
+def orb_bare() -> Callable[[np.ndarray], object]:
+    """Give plain ORB as it is, without making arrays of its key points."""
+    plain = cv2.ORB_create(1000)
+    return lambda grey: plain.detectAndCompute(grey, None)
+
+
+def main() -> None:
+    """Read the arguments and print the figures of each recording."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("recordings", nargs="+", metavar="RECORDING")
+    parser.add_argument("-s", "--set", action="append", default=[], metavar="KEY=VALUE", dest="assignments")
+    parser.add_argument("--pairs", type=int, default=40, help="pairs of frames, default 40")
+    arguments = parser.parse_args()
+    cv2.setNumThreads(1)
+    try:
+        settings = config_io.apply(Config(), arguments.assignments)
+        for target in arguments.recordings:
+            for line in report(Recording(target), settings, arguments.pairs):
+                print(line, flush=True)
+    except SlamError as error:
+        raise SystemExit(f"Error: {error}") from None
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,211 @@
+"""slamcli eval ape | rpe | map."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from slamcli.cli.common import json_option, run_option
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from slamcli.rundir import RunDir
+    from slamcli.schema import Trajectory
+
+APE_COLUMNS = {
+    "name": ("trajectory", ""),
+    "stage": ("stage", ""),
+    "rmse": ("RMSE [m]", ".4f"),
+    "mean": ("mean", ".4f"),
+    "median": ("median", ".4f"),
+    "std": ("std", ".4f"),
+    "max": ("max", ".4f"),
+    "n_frames": ("frames", "d"),
+    "lost": ("lost", "d"),
+    "coverage": ("coverage", ".1%"),
+    "scale": ("scale", ".4f"),
+    "rmse_scaled": ("RMSE scaled [m]", ".4f"),
+}
+RPE_COLUMNS = {
+    "name": ("trajectory", ""),
+    "stage": ("stage", ""),
+    "delta": ("over", "g"),
+    "unit": ("unit", ""),
+    "rmse": ("RMSE [m]", ".4f"),
+    "median": ("median", ".4f"),
+    "max": ("max", ".4f"),
+    "rotation_rmse_deg": ("RMSE [deg]", ".3f"),
+    "rotation_median_deg": ("median", ".3f"),
+    "rotation_max_deg": ("max", ".3f"),
+    "n_pairs": ("pairs", "d"),
+    "coverage": ("coverage", ".1%"),
+}
+
+
+@click.group("eval")
+def eval_group() -> None:
+    """Compare a run with the truth."""
+
+
+def _trajectory_options(function: Any) -> Any:
+    """Add what ape and rpe have in common."""
+    for decorator in (
+        click.argument("runs", nargs=-1, metavar="[RUN]..."),
+        run_option,
+        click.option(
+            "--stage", type=click.Choice(["track", "optimize", "loop", "all"]), help="Whose trajectory. [default: the last there is]"
+        ),
+        click.option("--other", multiple=True, metavar="NAME=FILE", help="Another system's trajectory of this recording (TUM format)."),
+        click.option("--plot", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE", help="Draw it (.png, .pdf, .svg)."),
+        click.option("--style", type=click.Choice(["text", "csv", "latex"]), default="text", show_default=True, help="Form of the table."),
+        json_option,
+    ):
+        function = decorator(function)
+    return function
+
+
+@eval_group.command("ape")
+@_trajectory_options
+def ape_command(
+    runs: tuple[str, ...], run: str | None, stage: str | None, other: tuple[str, ...], plot: Path | None, style: str, as_json: bool
+) -> None:
+    """Absolute pose error: SE(3) alignment, no scale, every colour frame that has a pose.
+
+    \b
+      slamcli eval ape                               the last run
+      slamcli eval ape --stage all                   what each stage is worth
+      slamcli eval ape runs/a runs/b --style latex   several in one table
+      slamcli eval ape --other ORB-SLAM3=f.txt --plot ape.png
+    """
+    from slamcli import evaluate, plots, tables
+
+    results = []
+    for folder in _open_runs(runs, run):
+        truth, n_frames = evaluate.ground_truth(folder), len(_frame_stamp(folder))
+        for name, which, estimate in _trajectories(folder, stage, other):
+            results.append(evaluate.ape(estimate, truth, n_frames=n_frames, name=name, stage=which))
+            if which:
+                _record(folder, "ape.json", results[-1].to_dict())
+    if plot is not None:
+        plots.plot_ape(results, plot)
+    rows = [result.to_dict() for result in results]
+    click.echo(_json(rows) if as_json else tables.render(rows, APE_COLUMNS, style))
+
+
+@eval_group.command("rpe")
+@_trajectory_options
+@click.option("--seconds", type=click.FloatRange(min=0, min_open=True), default=1.0, show_default=True, help="Interval.")
+def rpe_command(
+    runs: tuple[str, ...], run: str | None, stage: str | None, other: tuple[str, ...], plot: Path | None, style: str, as_json: bool,
+    seconds: float,
+) -> None:  # fmt: skip
+    """Relative pose error: drift over one second, and from one frame to the next."""
+    from slamcli import evaluate, plots, tables
+
+    results, rows = [], []
+    for folder in _open_runs(runs, run):
+        truth, frame_stamp = evaluate.ground_truth(folder), _frame_stamp(folder)
+        for name, which, estimate in _trajectories(folder, stage, other):
+            over_time, per_frame = (
+                evaluate.rpe(estimate, truth, frame_stamp=frame_stamp, name=name, stage=which, seconds=interval)
+                for interval in (seconds, None)
+            )
+            results.append(over_time)
+            rows.append({**over_time.to_dict(), "per_frame": per_frame.to_dict()})
+            if which:
+                _record(folder, "rpe.json", rows[-1])
+    if plot is not None:
+        plots.plot_rpe(results, plot)
+    flat = [part for row in rows for part in (row, row["per_frame"])]
+    click.echo(_json(rows) if as_json else tables.render(flat, RPE_COLUMNS, style))
+
+
+@eval_group.command("map")
+@run_option
+@json_option
+def map_command(run: str | None, as_json: bool) -> None:
+    """Octree against the depth images; of a simulated recording also the grid against its scene.
+
+    The first replays the key frames and counts the cells of the octree whose state agrees, as OctoMap's eval_octree_accuracy does.
+    """
+    from slamcli import console, evaluate_map
+    from slamcli.rundir import RunDir
+
+    folder = RunDir.find(run)
+    figures: dict[str, Any] = {"octree": evaluate_map.octree_accuracy(folder, progress=console.progress)}
+    if folder.record("grid2d") is not None and evaluate_map.has_scene(folder):
+        figures["grid"] = evaluate_map.grid_score(folder, progress=console.progress)
+    _record(folder, "map.json", figures)
+    click.echo(_json([figures]) if as_json else "\n".join(_map_lines(figures)))
+
+
+def _map_lines(figures: dict[str, Any]) -> list[str]:
+    octree = figures["octree"]
+    share = f"{octree['accuracy']:.2%}" if octree["accuracy"] is not None else "none"
+    lines = [f"octree: {share} of the cells seen are right ({octree['scans']} scans, {octree['wrong']} cells wrong)"]
+    if grid := figures.get("grid"):
+        lines += [
+            f"grid: {grid['free_is_free']:.2%} of the cells called free are free",
+            f"      {grid['floor_is_free']:.2%} of the floor seen is called free, {grid['floor_is_occupied']:.2%} occupied",
+            f"      {grid['outline_is_occupied']:.2%} of the obstacles' outlines seen are occupied",
+        ]
+        lines += [f"      {name}: {box['occupied']} of {box['cells']} cells occupied" for name, box in grid["special"].items()]
+    return lines
+
+
+def _open_runs(runs: tuple[str, ...], run: str | None) -> list[RunDir]:
+    from slamcli.rundir import RunDir
+
+    if runs and run is not None:
+        raise click.UsageError("name runs either as arguments or with -r, not both")
+    return [RunDir.find(name) for name in runs] if runs else [RunDir.find(run)]
+
+
+def _label(folder: RunDir) -> str:
+    """Name a run in a table: its place below runs/, which tells two runs of one recording apart."""
+    from slamcli.rundir import RUNS
+
+    path = folder.path.resolve()
+    return path.relative_to(RUNS.resolve()).as_posix() if path.is_relative_to(RUNS.resolve()) else path.name
+
+
+def _frame_stamp(folder: RunDir) -> np.ndarray:
+    from slamcli.schema import Features
+
+    return folder.load(Features, "extract").stamp
+
+
+def _trajectories(folder: RunDir, stage: str | None, other: tuple[str, ...]) -> list[tuple[str, str, Trajectory]]:
+    """Give (name, stage, trajectory) of the run's stages asked for, then of other systems, whose stage is ""."""
+    from slamcli import evaluate
+    from slamcli.formats.trajectory import read_tum
+
+    last = evaluate.last_stage(folder)
+    stages = evaluate.STAGES[: evaluate.STAGES.index(last) + 1] if stage == "all" else (stage or last,)
+    found = [(_label(folder), which, evaluate.stage_trajectory(folder, which)) for which in stages]
+    for item in other:
+        name, equals, file = item.partition("=")
+        if not (name and equals and file):
+            raise click.BadParameter(f"{item!r}: expected NAME=FILE, such as ORB-SLAM3=CameraTrajectory.txt", param_hint="--other")
+        found.append((name, "", read_tum(Path(file))))
+    return found
+
+
+def _record(folder: RunDir, file: str, figures: dict) -> None:
+    """Keep the figures with the run; one that may not be written to is evaluated all the same."""
+    from slamcli import files
+
+    target = folder.path / "eval" / file
+    try:
+        target.parent.mkdir(exist_ok=True)
+        files.write_text(target, _json([figures]) + "\n")
+    except OSError as error:
+        click.echo(f"Warning: {target} cannot be written ({error.strerror})", err=True)
+
+
+def _json(rows: list[dict]) -> str:
+    return json.dumps(rows[0] if len(rows) == 1 else rows, indent=1)

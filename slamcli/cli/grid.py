@@ -1,0 +1,162 @@
+"""slamcli export-grid, slamcli plan."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from slamcli.cli.common import json_option, run_option
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from slamcli.mapping.planner import Route
+    from slamcli.rundir import RunDir
+    from slamcli.schema import Grid
+
+
+class Place(click.ParamType):
+    """A place on the floor as x,y in metres."""
+
+    name = "x,y"
+
+    def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> tuple[float, float]:
+        """Read two numbers."""
+        try:
+            x, y = (float(part) for part in str(value).split(","))
+        except ValueError:
+            self.fail(f"{value!r} is not a place such as 0.5,1.0", param, ctx)
+        return x, y
+
+
+@click.command("export-grid")
+@click.argument("out", type=click.Path(path_type=Path, dir_okay=False))
+@run_option
+@click.option(
+    "--png", type=click.Path(path_type=Path, dir_okay=False), help="Also draw a picture with the trajectory, a scale bar and a legend."
+)
+def export_grid(out: Path, run: str | None, png: Path | None) -> None:
+    """Write the navigation grid OUT (.pgm) and its page (.yaml) beside it, for map_server and nav2.
+
+    \b
+      slamcli export-grid map.pgm --png map.png
+    """
+    from slamcli.formats import grid_map
+    from slamcli.rundir import RunDir
+    from slamcli.schema import Grid
+
+    folder = RunDir.find(run)
+    grid = folder.load(Grid, "grid2d")
+    warn_without_floor(folder)
+    written: tuple[Path, ...] = grid_map.write(out, grid_map.GridMap(grid.state, tuple(grid.origin.tolist()), float(grid.resolution)))
+    if png is not None:
+        from slamcli.grid_picture import save_picture
+
+        save_picture(png, grid, trajectory=camera_path(folder), title=str(folder.info()["dataset"]))
+        written = (*written, png)
+    rows, columns = grid.state.shape
+    click.echo(f"{', '.join(str(path) for path in written)}: {columns} x {rows} cells of {float(grid.resolution):g} m", err=True)
+
+
+@click.command()
+@click.option("--start", type=Place(), required=True, help="Where the robot is, such as 0.5,1.0 [m].")
+@click.option("--goal", type=Place(), required=True, help="Where it is to go [m].")
+@run_option
+@click.option("--map", "page", type=click.Path(path_type=Path, dir_okay=False), help="Plan on this grid map (.yaml) instead of the run's.")
+@click.option("--radius", default=0.2, show_default=True, help="Of the robot [m].")
+@click.option("--clearance", default=0.3, show_default=True, help="Being nearer to obstacles than this beyond the radius costs [m].")
+@click.option("--weight", default=3.0, show_default=True, help="How much more a metre along an obstacle costs than one in the open.")
+@click.option("--allow-unknown", is_flag=True, help="Drive through cells that were never seen, too.")
+@click.option("-o", "--out", type=click.Path(path_type=Path, dir_okay=False), help="Write the path: .csv or .json.")
+@click.option("--png", type=click.Path(path_type=Path, dir_okay=False), help="Draw the path. [default: plan.png in the run directory]")
+@json_option
+def plan(
+    start: tuple[float, float], goal: tuple[float, float], run: str | None, page: Path | None, radius: float, clearance: float,
+    weight: float, allow_unknown: bool, out: Path | None, png: Path | None, as_json: bool,
+) -> None:  # fmt: skip
+    """Plan a path on the navigation grid and draw it; prints it as CSV: x,y,clearance in metres, level frame.
+
+    The level frame's origin is below the first camera, x its heading, z up. What was never seen counts as blocked.
+
+    \b
+      slamcli plan --start 0.5,1.0 --goal 3,2
+      slamcli plan --start 0.5,1.0 --goal 3,2 -o path.json --png path.png
+    """
+    from slamcli.grid_picture import save_picture
+    from slamcli.mapping import planner
+    from slamcli.rundir import RunDir
+    from slamcli.schema import Grid
+
+    trajectory = None
+    if page is None:
+        folder = RunDir.find(run)
+        grid = folder.load(Grid, "grid2d")
+        warn_without_floor(folder)
+        trajectory, title = camera_path(folder), str(folder.info()["dataset"])
+        png = png or folder.path / "plan.png"
+    else:
+        grid, title = _read_map(page), page.name
+    route = planner.plan(grid, start, goal, radius=radius, clearance=clearance, weight=weight, allow_unknown=allow_unknown)
+    texts = {".csv": _csv(route), ".json": _json(route, start, goal, radius)}
+    if out is not None:
+        _write(out, texts)
+    if png is not None:
+        save_picture(png, grid, trajectory=trajectory, route=route.xy, radius=radius, title=f"{title}: path of {route.length:.2f} m")
+    click.echo(texts[".json" if as_json else ".csv"], nl=False)
+    least = f"{float(route.clearance.min()) + radius:.2f} m"
+    picture = f"; drawn in {png}" if png else ""
+    click.echo(f"{route.length:.2f} m, never nearer than {least} to what is not free{picture}", err=True)
+
+
+def _csv(route: Route) -> str:
+    lines = (f"{x:.4f},{y:.4f},{clear:.4f}\n" for (x, y), clear in zip(route.xy, route.clearance, strict=True))
+    return "x,y,clearance\n" + "".join(lines)
+
+
+def _json(route: Route, start: tuple[float, float], goal: tuple[float, float], radius: float) -> str:
+    about = {
+        "frame": "level", "start": start, "goal": goal, "radius": radius, "length": round(route.length, 4),
+        "points": [[round(float(v), 4) for v in xy] for xy in route.xy],
+        "clearance": [round(float(v), 4) if v < 1e9 else None for v in route.clearance],
+    }  # fmt: skip
+    return json.dumps(about) + "\n"
+
+
+def _write(out: Path, texts: dict[str, str]) -> None:
+    from slamcli.errors import SlamError
+
+    if out.suffix not in texts:
+        raise SlamError(f"{out}: a path is written as .csv or .json")
+    out.write_text(texts[out.suffix], encoding="utf-8")
+
+
+def _read_map(page: Path) -> Grid:
+    import numpy as np
+
+    from slamcli.formats import grid_map
+    from slamcli.schema import Grid
+
+    read = grid_map.read(page)
+    p_occupied = np.where(read.state < 0, np.nan, read.state).astype(np.float32)
+    n_seen = (read.state >= 0).astype(np.int32)
+    return Grid(p_occupied, n_seen, read.state, np.array(read.origin), np.array(read.resolution))
+
+
+def camera_path(folder: RunDir) -> np.ndarray:
+    """Give the camera centres (F, 3) of every frame in the level frame, NaN where lost."""
+    from slamcli.geometry import se3
+    from slamcli.schema import Ground, Map, Tracks, frame_poses
+
+    T_wc = frame_poses(folder.load(Tracks, "loop"), folder.load(Map, "loop"))
+    return se3.transform(folder.load(Ground, "densify").T_lw, T_wc[:, :3, 3])
+
+
+def warn_without_floor(folder: RunDir) -> None:
+    """Say it when heights in this run's grid mean nothing."""
+    from slamcli.schema import Ground
+
+    if not folder.load(Ground, "densify").is_found:
+        click.echo("Warning: no floor was found in this run, so its grid is not fit to drive on", err=True)

@@ -1,0 +1,78 @@
+"""The command line: one group, every command, and what an error looks like to its user."""
+
+import errno
+import importlib
+import importlib.util
+from typing import Any
+
+import click
+
+from slamcli import __version__
+from slamcli.cli.common import verbose_option
+from slamcli.errors import SlamError
+
+TOPICS = ("run", "evaluate", "export", "maps", "grid", "look", "simulate", "features", "vocab")  # modules of this package
+
+
+class Group(click.Group):
+    """A group that turns what the user can mend into one line, and lists its commands in the order in which they were added."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """Keep the order of work instead of the alphabet's."""
+        return list(self.commands)
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run the command. Status 1: the user can mend it; 130: interrupted. Anything else is a bug and keeps its traceback."""
+        try:
+            return super().invoke(ctx)
+        except SlamError as error:
+            raise click.ClickException(str(error)) from error
+        except OSError as error:
+            if error.errno is None or error.errno == errno.EPIPE:
+                raise
+            raise click.ClickException(_told(error)) from error
+        except MemoryError as error:
+            raise click.ClickException("out of memory; close other programs or use fewer features, a coarser voxel") from error
+        except KeyboardInterrupt as error:
+            click.echo(f"Error: {error if error.args else 'interrupted'}", err=True)
+            ctx.exit(130)
+
+
+def _told(error: OSError) -> str:
+    place = f"{error.filename}: " if error.filename is not None else ""
+    advice = {
+        errno.ENOSPC: "; free some space and give the same command again",
+        errno.EACCES: "; choose a place you may write to, such as with -r",
+        errno.EROFS: "; choose a place you may write to, such as with -r",
+    }
+    return f"{place}{error.strerror}{advice.get(error.errno or 0, '')}"
+
+
+@click.group(cls=Group, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(__version__, prog_name="slamcli")
+@verbose_option
+def cli() -> None:
+    """Turn a recording of a colour-and-depth camera into trajectory, cloud, octree and navigation grid.
+
+    \b
+      slamcli run demo                 a simulated room, nothing to download
+      slamcli run tum/fr1_room         found under the data folder, else downloaded
+      slamcli status                   what is up to date, stale and why, missing
+      slamcli track -s track.min_inliers=20
+      slamcli eval ape                 error against the true trajectory
+      slamcli export-grid map.pgm      for map_server and nav2
+
+    Commands that name no run use the last one.
+    """
+
+
+def _commands_of(module: Any) -> list[click.Command]:
+    found = [value for value in vars(module).values() if isinstance(value, click.Command)] + list(getattr(module, "stage_commands", ()))
+    members = {id(member) for group in found if isinstance(group, click.Group) for member in group.commands.values()}
+    return [command for command in found if id(command) not in members]
+
+
+for topic in TOPICS:
+    if importlib.util.find_spec(f"slamcli.cli.{topic}"):
+        for command in _commands_of(importlib.import_module(f"slamcli.cli.{topic}")):
+            cli.add_command(verbose_option(command))

@@ -1,0 +1,158 @@
+"""slamcli export-cloud, export-octree, export-mesh, render."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from slamcli.cli.common import run_option
+from slamcli.errors import SlamError
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from slamcli.render import View
+    from slamcli.rundir import RunDir
+
+out_argument = click.argument("out", type=click.Path(path_type=Path, dir_okay=False))
+
+
+@click.command("export-cloud")
+@out_argument
+@run_option
+@click.option("--frame", type=click.Choice(["level", "world"]), default="level", show_default=True, help="level: z up, floor at z = 0.")
+def export_cloud(out: Path, run: str | None, frame: str) -> None:
+    """Write the coloured cloud with normals to OUT (.ply or .pcd).
+
+    \b
+      slamcli export-cloud cloud.ply
+      slamcli export-cloud cloud.pcd --frame world
+    """
+    from slamcli.formats import cloud
+    from slamcli.geometry import se3
+    from slamcli.rundir import RunDir
+    from slamcli.schema import Ground
+
+    _check_suffix(out, ".ply", ".pcd")
+    folder = RunDir.find(run)
+    xyz, rgb, normal = cloud.read_ply(folder.stage_path("densify", "cloud.ply"))
+    if frame == "world":
+        T_wl = se3.inverse(folder.load(Ground, "densify").T_lw)
+        xyz = se3.transform(T_wl, xyz)
+        normal = None if normal is None else normal @ T_wl[:3, :3].T
+    cloud.write(out, xyz, rgb, normal)
+    click.echo(f"{out}: {len(xyz)} points", err=True)
+
+
+@click.command("export-octree")
+@out_argument
+@run_option
+def export_octree(out: Path, run: str | None) -> None:
+    """Write the octree to OUT for OctoMap and octovis: .bt (free or occupied, small) or .ot (with probabilities).
+
+    \b
+      slamcli export-octree map.bt
+    """
+    from slamcli.rundir import RunDir
+
+    suffix = _check_suffix(out, ".bt", ".ot")
+    path = RunDir.find(run).stage_path("octree", f"map{suffix}")
+    shutil.copyfile(path, out)
+    click.echo(f"{out}: {out.stat().st_size} bytes", err=True)
+
+
+@click.command("export-mesh")
+@out_argument
+@run_option
+@click.option("--voxel", type=click.FloatRange(0.002, 0.5), default=0.02, show_default=True, help="Resolution of the surface [m].")
+def export_mesh(out: Path, run: str | None, voxel: float) -> None:
+    """Make a coloured triangle mesh of the key frames' depth and write it to OUT (.ply), in the level frame.
+
+    \b
+      slamcli export-mesh mesh.ply
+      slamcli export-mesh fine.ply --voxel 0.01
+    """
+    from dataclasses import replace
+
+    from slamcli import console
+    from slamcli.formats.cloud import write_ply_mesh
+    from slamcli.mapping.tsdf import Volume
+    from slamcli.rundir import RunDir
+    from slamcli.schema import Ground
+    from slamcli.stages import densify
+
+    _check_suffix(out, ".ply")
+    folder = RunDir.find(run)
+    config, camera, T_lw = folder.config(), folder.camera(), folder.load(Ground, "densify").T_lw
+    option = replace(config.densify, method="tsdf", voxel=voxel)
+    poses = console.progress(densify.keyframe_depth_poses(folder), "mesh")
+    volume = Volume(camera, voxel=voxel, depth_max=option.depth_max)
+    for view in densify.views(folder.dataset(), camera, poses, config.sensor, option, workers=config.run.workers):
+        volume.add(view.seen, view.rgb, view.T_wk)
+    mesh = volume.mesh().moved(T_lw)
+    if not len(mesh.triangle):
+        raise SlamError("the mesh is empty: no key frame has depth within densify.depth_max")
+    write_ply_mesh(out, mesh.xyz, mesh.triangle, mesh.rgb, mesh.normal)
+    click.echo(f"{out}: {len(mesh.triangle)} triangles", err=True)
+
+
+def _check_suffix(out: Path, *suffixes: str) -> str:
+    if out.suffix.lower() not in suffixes:
+        raise SlamError(f"{out}: the name must end in {' or '.join(suffixes)}")
+    return out.suffix.lower()
+
+
+@click.command("render")
+@out_argument
+@run_option
+@click.option("--what", type=click.Choice(["cloud", "octree"]), default="cloud", show_default=True, help="What to draw.")
+@click.option("--azimuth", type=float, default=235.0, show_default=True, help="Where the camera stands, from x towards y [degrees].")
+@click.option("--elevation", type=click.FloatRange(-89, 89), default=42.0, show_default=True, help="How high it stands [degrees].")
+@click.option("--size", type=(click.IntRange(16, 8192), click.IntRange(16, 8192)), default=(1280, 960), help="[px]; default: 1280 960.")
+@click.option("--path/--no-path", "with_path", default=False, help="Also draw the camera's path.")
+def render_command(out: Path, run: str | None, what: str, azimuth: float, elevation: float, size: tuple[int, int], with_path: bool) -> None:
+    """Draw the cloud or the octree to OUT (.png), from outside through the near walls. Needs no display.
+
+    \b
+      slamcli render cloud.png
+      slamcli render octree.png --what octree --azimuth 45
+    """
+    import cv2
+
+    from slamcli import render
+    from slamcli.rundir import RunDir
+
+    _check_suffix(out, ".png", ".jpg")
+    folder = RunDir.find(run)
+    view = render.View(azimuth_deg=azimuth, elevation_deg=elevation, width=size[0], height=size[1])
+    image = (_draw_cloud if what == "cloud" else _draw_octree)(folder, view, _camera_path(folder) if with_path else None)
+    done, data = cv2.imencode(out.suffix.lower(), image[..., ::-1])
+    if not done:
+        raise SlamError(f"{out}: the picture cannot be encoded")
+    out.write_bytes(data.tobytes())
+    click.echo(f"{out}: {size[0]} x {size[1]} px", err=True)
+
+
+def _draw_cloud(folder: RunDir, view: View, path: np.ndarray | None) -> np.ndarray:
+    from slamcli import render
+    from slamcli.formats import cloud
+
+    xyz, rgb, normal = cloud.read_ply(folder.stage_path("densify", "cloud.ply"))
+    return render.draw_cloud(xyz, rgb, normal, spacing=folder.config().densify.voxel, view=view, path=path)
+
+
+def _draw_octree(folder: RunDir, view: View, path: np.ndarray | None) -> np.ndarray:
+    from slamcli import render
+    from slamcli.formats import octomap
+
+    return render.draw_octree(octomap.read(folder.stage_path("octree", "map.ot")), view=view, path=path)
+
+
+def _camera_path(folder: RunDir) -> np.ndarray:
+    from slamcli.schema import Features, Ground, Map, Tracks, trajectory
+
+    poses = trajectory(folder.load(Features, "extract").stamp, folder.load(Tracks, "loop"), folder.load(Map, "loop"))
+    return (folder.load(Ground, "densify").T_lw @ poses.T_wc)[:, :3, 3]

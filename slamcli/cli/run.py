@@ -1,0 +1,194 @@
+"""`run`, one command per stage, `status` and `config`."""
+
+import json
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from slamcli.cli.common import config_option, json_option, run_option, set_option
+from slamcli.stages import NAMES, STAGES, Stage
+
+if TYPE_CHECKING:
+    from slamcli.config import Config
+    from slamcli.datasets import Dataset
+    from slamcli.freshness import State
+    from slamcli.pipeline import Pipeline
+    from slamcli.rundir import RunDir
+
+STAGE = click.Choice(NAMES)
+
+
+@click.command("run")
+@click.argument("target", required=False)
+@click.option("-r", "--run", metavar="DIR", help="Where the run goes. [default: $SLAMCLI_RUN, else runs/<recording>]")
+@click.option("--data", metavar="DIR", help="Where recordings lie. [default: $SLAMCLI_DATA, else ./data]")
+@config_option
+@set_option
+@click.option("--from", "start", type=STAGE, help="Run this stage and those after it even if they are up to date.")
+@click.option("--until", type=STAGE, help="Stop after this stage.")
+@click.option("--force", is_flag=True, help="Run every stage even if it is up to date.")
+def run_command(
+    target: str | None,
+    run: str | None,
+    data: str | None,
+    config_name: str | None,
+    assignments: tuple[str, ...],
+    start: str | None,
+    until: str | None,
+    force: bool,
+) -> None:
+    """Bring a run up to date: exactly the stages that need it.
+
+    TARGET is a recording: `demo` for a simulated room, a folder, or a name such as `tum/fr1_room`, which is downloaded when it is not
+    found. Without TARGET an existing run goes on. Prints the run directory.
+
+    \b
+      slamcli run demo
+      slamcli run tum/fr1_room -s extract.features=1500
+      slamcli run path/to/recording -r runs/mine --config accurate
+    """
+    from slamcli import config_io
+    from slamcli.rundir import RunDir
+
+    if target is None:
+        rundir, dataset = RunDir.find(run), None
+        config = config_io.resolve(rundir.config(), config_name, assignments)
+    else:
+        rundir, dataset, config = _run_of(target, run, data, config_name, assignments)
+    with _writing(rundir, config, dataset) as pipeline:
+        rundir.mark_latest()
+        pipeline.bring_up_to_date(start=start, until=until, force=force)
+    click.echo(rundir.path)
+
+
+def _run_of(
+    target: str, run: str | None, data: str | None, config_name: str | None, assignments: tuple[str, ...]
+) -> "tuple[RunDir, Dataset, Config]":
+    """Open the recording and make or open its run."""
+    from slamcli import config_io
+    from slamcli.rundir import RunDir, default_path
+
+    named = run or os.environ.get("SLAMCLI_RUN")
+    config = config_io.resolve(RunDir(Path(named)).config() if named else None, config_name, assignments)
+    dataset = _open(target, data, config)
+    path = Path(named) if named else default_path(dataset.name)
+    camera = config.camera
+    config = config_io.resolve(RunDir(path).config(), config_name, assignments)
+    if config.camera != camera:  # only now is it known that an earlier command gave this run another camera
+        dataset = _open(target, data, config)
+    rundir = RunDir.create(path, dataset=dataset.name, root=str(dataset.root.resolve()), digest=dataset.digest())
+    return rundir, dataset, config
+
+
+def _open(target: str, data: str | None, config: "Config") -> "Dataset":
+    from slamcli import console
+    from slamcli.datasets import open_dataset
+
+    return open_dataset(target, data=data, camera=dict(config.camera) or None, progress=console.progress)
+
+
+@contextmanager
+def _writing(rundir: "RunDir", config: "Config", dataset: "Dataset | None" = None) -> "Iterator[Pipeline]":
+    """Lock the run, log to its file, and make `config` its configuration."""
+    from slamcli import console
+    from slamcli.pipeline import Pipeline
+
+    with rundir.lock(), console.log_file(rundir.path / "log.txt"):
+        rundir.write_config(config)
+        yield Pipeline(rundir, config, dataset=dataset)
+
+
+def _stage_command(stage: Stage) -> click.Command:
+    @click.command(stage.name, short_help=stage.help, help=_stage_help(stage))
+    @run_option
+    @set_option
+    def command(run: str | None, assignments: tuple[str, ...]) -> None:
+        from slamcli import config_io
+        from slamcli.rundir import RunDir
+
+        rundir = RunDir.find(run)
+        with _writing(rundir, config_io.apply(rundir.config(), assignments)) as pipeline:
+            pipeline.run_alone(stage.name)
+
+    return command
+
+
+def _stage_help(stage: Stage) -> str:
+    needs = ", ".join("the recording" if name == "dataset" else name for name in stage.needs)
+    options = ", ".join(stage.config)
+    return f"{stage.help}\n\nRuns this stage alone, even when it is up to date. It reads {needs}; options: seed and those of {options}."
+
+
+stage_commands = tuple(_stage_command(stage) for stage in STAGES)
+
+
+@click.command("status")
+@run_option
+@config_option
+@set_option
+@json_option
+@click.option("--verify", is_flag=True, help="Read every file again and compare its digest.")
+def status_command(run: str | None, config_name: str | None, assignments: tuple[str, ...], as_json: bool, verify: bool) -> None:
+    """Show which stages are up to date, and why the others are not.
+
+    With -s or --config it shows what such a change would make stale, and changes nothing.
+    """
+    from slamcli import config_io
+    from slamcli.pipeline import Pipeline
+    from slamcli.rundir import RunDir
+
+    rundir = RunDir.find(run)
+    pipeline = Pipeline(rundir, config_io.resolve(rundir.config(), config_name, assignments))
+    states = pipeline.states(verify=verify)
+    if as_json:
+        click.echo(json.dumps([_state_object(state) for state in states.values()], indent=1))
+    else:
+        click.echo(_state_table(rundir, states))
+    for note in pipeline.notes(states):
+        click.echo(f"note: {note}", err=as_json)
+
+
+def _state_object(state: "State") -> dict[str, Any]:
+    names = ("seconds", "fps", "cpu_seconds", "peak_rss_mb", "digest", "summary", "warnings")
+    return {"stage": state.stage, "state": state.state, "reason": state.reason, **{name: state.record.get(name) for name in names}}
+
+
+def _state_table(rundir: "RunDir", states: "dict[str, State]") -> str:
+    from slamcli.console import table
+
+    rows = []
+    for state in states.values():
+        seconds, fps = state.record.get("seconds"), state.record.get("fps")
+        times = [f"{seconds:.1f} s" if seconds is not None else "", f"{fps:.1f} fps" if fps else ""]
+        rows.append([state.stage, state.state, *times, state.reason])
+    return f"{rundir.path}: {rundir.info()['dataset']} ({rundir.info()['root']})\n" + table(rows, right=(2, 3))
+
+
+@click.command("config")
+@click.argument("names", nargs=-1, metavar="[SECTION|SECTION.KEY]...")
+@run_option
+@config_option
+@set_option
+@click.option("--defaults", is_flag=True, help="Show the defaults, whatever run there is.")
+@click.option("--explain", is_flag=True, help="Show what each option means, its unit and its bounds.")
+def config_command(
+    names: tuple[str, ...], run: str | None, config_name: str | None, assignments: tuple[str, ...], defaults: bool, explain: bool
+) -> None:
+    """Show the configuration of the run as TOML; of a run to be, where there is none yet.
+
+    \b
+      slamcli config --explain track
+      slamcli config extract.features
+    """
+    from slamcli import config_io
+    from slamcli.config import Config
+    from slamcli.rundir import LATEST, RunDir
+
+    has_run = run or os.environ.get("SLAMCLI_RUN") or LATEST.exists()
+    base = RunDir.find(run).config() if has_run and not defaults else Config()
+    config = config_io.resolve(base, config_name, assignments)
+    click.echo(config_io.dump(config, explain=explain, only=names), nl=False)

@@ -1,0 +1,57 @@
+"""slamcli simulate: render a recording with exact truth."""
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+
+@click.command(short_help="Render a simulated recording with exact truth.")
+@click.argument("out", type=click.Path(path_type=Path))
+@click.option("--seed", default=0, show_default=True, help="Another seed is another room.")
+@click.option("--frames", type=int, help="Images to take. [default: 360; with --speed or --turn-rate what the drive needs]")
+@click.option("--laps", default=1.09, show_default=True, help="Rounds driven; more than 1 closes the loop.")
+@click.option("--speed", type=float, help="Top speed [m/s]. [default: 0.6]")
+@click.option("--turn-rate", type=float, help="Top turn rate [rad/s]. [default: 0.8]")
+@click.option("--rate", default=15.0, show_default=True, help="Images a second.")
+@click.option("--width", default=640, show_default=True, help="[px]")
+@click.option("--height", default=480, show_default=True, help="[px]")
+@click.option("--field-of-view", default=62.7, show_default=True, help="Horizontal [degrees].")
+@click.option("--camera-height", default=0.75, show_default=True, help="[m]")
+@click.option("--pitch", default=-12.0, show_default=True, help="Of the camera [degrees]; 27 sees no floor.")
+@click.option("--noise", type=click.Choice(["kinect", "none"]), default="kinect", show_default=True, help="none: exact images.")
+@click.option("--depth-min", default=0.4, show_default=True, help="Nearest reading of the noisy camera [m].")
+@click.option("--depth-max", default=5.0, show_default=True, help="Farthest reading of the noisy camera [m].")
+@click.option("--textured", default=1.0, show_default=True, help="Share of objects and walls with a picture; 0 = shading only.")
+@click.option("--moved-object", "movable", is_flag=True, help="A parcel is taken away half-way.")
+@click.option(
+    "--alias", type=click.Choice(["posters", "corridor"]), default=None, help="Places that look alike: opposite walls, equal doors."
+)
+@click.option("--room", type=(float, float), default=(8.0, 5.0), show_default=True, help="Sides of the room [m].")
+@click.option("--trajectory", type=click.Path(path_type=Path), help="Follow a TUM trajectory instead; the room is made large enough.")
+@click.option("--stamps", type=click.Path(path_type=Path), help="Colour and depth stamps for --trajectory, two a line.")
+def simulate(out: Path, frames: int | None, speed: float | None, turn_rate: float | None, alias: str | None, **settings: Any) -> None:
+    """Render a furnished room and a drive through it into the new folder OUT.
+
+    OUT has the TUM layout: colour and depth images, groundtruth.txt (exact), camera.json, and scene.json with every obstacle. The same
+    settings give the same recording.
+
+    \b
+      slamcli simulate room --seed 3
+      slamcli simulate lab --speed 0.15 --turn-rate 0.15 --laps 1 --field-of-view 57 --depth-min 1.2 --depth-max 3.5
+      slamcli simulate hand --trajectory fr1_room.txt --stamps fr1_room_stamps.txt
+    """
+    from slamcli import console
+    from slamcli.datasets.simulate import simulate as render
+    from slamcli.errors import SlamError
+
+    if settings["stamps"] is not None and settings["trajectory"] is None:
+        raise SlamError("--stamps needs --trajectory")
+    if speed is not None:
+        settings["speed"] = speed
+    if turn_rate is not None:
+        settings["turn_rate"] = turn_rate
+    if frames is None and speed is None and turn_rate is None and settings["trajectory"] is None:
+        frames = 360
+    render(out, progress=console.progress, frames=frames, alias=alias or "", **settings)
+    click.echo(out)

@@ -1,0 +1,126 @@
+"""slamcli vocab train | import | export | info."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import click
+
+from slamcli.cli.common import json_option
+
+
+@click.group()
+def vocab() -> None:
+    """Make, convert and look at vocabularies of visual words.
+
+    \b
+      slamcli vocab train office.npz pictures/ tum/fr1_room
+      slamcli vocab import ORBvoc.txt
+      slamcli match -s match.vocabulary=office.npz
+    """
+
+
+@vocab.command(short_help="Train a vocabulary on pictures and recordings.")
+@click.argument("out", type=click.Path(path_type=Path, dir_okay=False))
+@click.argument("sources", nargs=-1, required=True)
+@click.option("--branching", type=click.IntRange(2, 20), default=12, show_default=True, help="Children of a node.")
+@click.option("--depth", type=click.IntRange(1, 10), default=4, show_default=True, help="Levels; words are at most branching^depth.")
+@click.option("--features", type=click.IntRange(50, 20000), default=2000, show_default=True, help="Key points taken of a picture.")
+@click.option("--every", type=click.IntRange(1), default=10, show_default=True, help="Take each so many-th frame of a recording.")
+@click.option("--min-size", type=click.IntRange(1), default=4, show_default=True, help="Clusters smaller than twice this are not split.")
+@click.option("--iterations", type=click.IntRange(1), default=10, show_default=True, help="Rounds of k-means at most.")
+@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Same pictures and seed: same file.")
+@click.option("--origin", default="", help="What it was trained on, kept in the file. [default: the names of the sources]")
+def train(
+    out: Path,
+    sources: tuple[str, ...],
+    branching: int,
+    depth: int,
+    features: int,
+    every: int,
+    min_size: int,
+    iterations: int,
+    seed: int,
+    origin: str,
+) -> None:
+    """Train a vocabulary on SOURCES, folders of pictures or recordings, and write it to OUT (.npz)."""
+    import numpy as np
+
+    from slamcli import console, training
+    from slamcli.vision import kmeans, vocabulary
+
+    descriptors = training.descriptors(sources, features=features, every=every, progress=console.progress)
+    names = ", ".join(Path(source).name for source in sources)
+    made = kmeans.train(
+        descriptors,
+        branching=branching,
+        depth=depth,
+        min_size=min_size,
+        iterations=iterations,
+        rng=np.random.default_rng(seed),
+        origin=origin or f"{len(descriptors)} pictures of {names}",
+        progress=console.progress,
+    )
+    vocabulary.save(out, made)
+    click.echo(f"{out}: {made.n_words} words, {out.stat().st_size / 1e6:.1f} MB, from {len(descriptors)} pictures")
+
+
+@vocab.command("import", short_help="Read a DBoW2 text file, such as ORBvoc.txt.")
+@click.argument("text", type=click.Path(path_type=Path, dir_okay=False))
+@click.argument("out", type=click.Path(path_type=Path, dir_okay=False), required=False)
+def import_(text: Path, out: Path | None) -> None:
+    """Read the DBoW2 vocabulary TEXT, such as ORBvoc.txt, and write it to OUT (default: its name with .npz)."""
+    from slamcli.formats import dbow2
+    from slamcli.vision import vocabulary
+
+    out = out or text.with_suffix(".npz")
+    tree = dbow2.read(text)
+    made = vocabulary.from_parents(tree.parent, tree.centre, tree.weight, origin=f"DBoW2 text file {text.name}", source=str(text))
+    vocabulary.save(out, made)
+    click.echo(f"{out}: {made.n_words} words, {out.stat().st_size / 1e6:.1f} MB")
+
+
+@vocab.command(short_help="Write a vocabulary as a DBoW2 text file.")
+@click.argument("out", type=click.Path(path_type=Path, dir_okay=False))
+@click.argument("vocabulary_file", metavar="[VOCABULARY]", type=click.Path(path_type=Path, dir_okay=False), required=False)
+def export(out: Path, vocabulary_file: Path | None) -> None:
+    """Write VOCABULARY (.npz), or the shipped one, to OUT as text, which ORB-SLAM and DBoW2 read."""
+    from slamcli.formats import dbow2
+    from slamcli.vision import vocabulary
+
+    made = vocabulary.load(vocabulary_file or "")
+    dbow2.write(out, dbow2.Tree(made.branching, made.depth, made.parent, made.centre[1:], made.node_weight))
+    click.echo(f"{out}: {made.n_words} words, {out.stat().st_size / 1e6:.1f} MB")
+
+
+@vocab.command(short_help="Say what a vocabulary is.")
+@click.argument("vocabulary_file", metavar="[VOCABULARY]", type=click.Path(path_type=Path, dir_okay=False), required=False)
+@json_option
+def info(vocabulary_file: Path | None, as_json: bool) -> None:
+    """Say what VOCABULARY (.npz), or the shipped one, holds and what it was trained on."""
+    import numpy as np
+
+    from slamcli.vision import vocabulary
+
+    path = vocabulary_file or vocabulary.SHIPPED
+    found = vocabulary.load(path)
+    facts = {
+        "file": str(path),
+        "bytes": path.stat().st_size,
+        "words": found.n_words,
+        "nodes": len(found.centre),
+        "branching": found.branching,
+        "depth": found.depth,
+        "words_per_level": np.bincount(found.level[found.word_of_node >= 0], minlength=found.depth + 1).tolist(),
+        "idf": [float(found.idf.min()), float(np.median(found.idf)), float(found.idf.max())],
+        "origin": found.origin,
+    }
+    if as_json:
+        click.echo(json.dumps(facts, indent=1))
+        return
+    low, middle, high = facts["idf"]
+    click.echo(f"{path}: {facts['bytes'] / 1e6:.2f} MB")
+    click.echo(f"  words      {found.n_words} in a tree of {len(found.centre)} nodes, {found.branching} children, {found.depth} levels")
+    click.echo(f"  weights    {low:.2f} to {high:.2f}, median {middle:.2f}")
+    click.echo(f"  origin     {found.origin or 'not said'}")

@@ -1,0 +1,232 @@
+"""The configuration: one frozen dataclass per section; every option carries its help and its bounds."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+
+def option(
+    default: Any,
+    help: str,
+    *,
+    ge: Any = None,
+    gt: Any = None,
+    le: Any = None,
+    lt: Any = None,
+    choices: tuple = (),
+    is_file: bool = False,
+) -> Any:
+    """Declare an option: default, help with unit in [brackets], bounds, or the values allowed.
+
+    `is_file` marks the name of an input file ("" = none): it is kept as an absolute path, and the file's content counts as an input
+    of every stage that declares the section.
+    """
+    bounds = {name: value for name, value in (("ge", ge), ("gt", gt), ("le", le), ("lt", lt)) if value is not None}
+    return field(default=default, metadata={"help": help, "bounds": bounds, "choices": tuple(choices), "is_file": is_file})
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """How a run is carried out; nothing here changes a result, and no stage declares it."""
+
+    workers: int = option(2, "threads that decode and extract", ge=1, le=64)
+
+
+@dataclass(frozen=True)
+class SensorConfig:
+    """The depth camera's noise and what a measurement is worth; shared by track, optimize, loop."""
+
+    depth_noise_base: float = option(0.008, "sigma_z = base + quadratic * (z - 0.4)^2 [m]", gt=0)
+    depth_noise_quadratic: float = option(0.008, "the growth of sigma_z with distance [1/m]", ge=0)
+    pixel_noise: float = option(1.0, "sigma of a key point at octave 0 [px]; grows with the octave's scale", gt=0)
+    depth_min: float = option(0.3, "nearer readings are ignored [m]", ge=0)
+    depth_max: float = option(8.0, "farther readings are ignored [m]", gt=0)
+
+
+@dataclass(frozen=True)
+class ExtractConfig:
+    """Spread-out ORB features."""
+
+    features: int = option(1000, "key points wanted per frame", ge=50, le=20000)
+    levels: int = option(8, "pyramid levels", ge=1, le=12)
+    scale: float = option(1.2, "scale between pyramid levels", gt=1.0, le=2.0)
+    cell: int = option(30, "cell side for FAST [px]", ge=8, le=200)
+    smooth: bool = option(True, "seek corners in a copy blurred by 1 px, against sensor noise")
+    fast_threshold: int = option(8, "FAST threshold, of the blurred copy if there is one [grey levels]", ge=1, le=255)
+    fast_threshold_low: int = option(5, "threshold where a cell stays empty [grey levels]", ge=1, le=255)
+    pool: float = option(1.3, "strongest corners kept for each key point wanted, before they are spread; 0 = all", ge=0, le=100)
+    rank_by: str = option("fast", "corners are ranked by their FAST score or by the sum of differences, [Z] (1)", choices=("fast", "sum"))
+    subpixel: bool = option(True, "place key points at the summit of the FAST score instead of at whole pixels of their level")
+    depth_window: int = option(1, "depth is the nearest pixel's, or the median of 3 x 3 or 5 x 5 [px]", choices=(1, 3, 5))
+
+
+@dataclass(frozen=True)
+class MatchConfig:
+    """Words and frame-to-frame matches."""
+
+    method: str = option("words", "what is compared: features under one vocabulary node, or all", choices=("words", "brute"))
+    vocabulary: str = option("", "vocabulary file; empty = the shipped one", is_file=True)
+    node_level: int = option(1, "levels below the root at which features are compared under the same node", ge=0, le=12)
+    node_margin: int = option(8, "a feature also counts under a second node that is at most this much farther [bits]", ge=-1, le=256)
+    window: int = option(1, "frames before it that each frame is matched to", ge=1, le=30)
+    max_distance: int = option(64, "descriptors farther apart are no match [bits]", ge=0, le=256)
+    ratio: float = option(0.8, "the nearest must be closer than this share of the second nearest's distance", gt=0, le=1)
+    check_rotation: bool = option(True, "keep only matches whose turn agrees with most others'")
+
+
+@dataclass(frozen=True)
+class TrackConfig:
+    """Tracking and the windowed bundle adjustment."""
+
+    min_inliers: int = option(15, "fewer inliers: the frame is lost", ge=4)
+    start_features: int = option(100, "features with depth that the first key frame needs", ge=4)
+    ransac_rounds: int = option(100, "P3P samples drawn per frame; M of [Z] 1.2", ge=1, le=100000)
+    ransac_threshold_px: float = option(4.0, "reprojection error of an inlier to P3P [px]; [Z] 1.2", gt=0)
+    search_radius_px: float = option(5.0, "window of the local map's search at octave 0 [px]", gt=0)
+    search_max_distance: int = option(80, "descriptors that differ more do not match [bits]", ge=1, le=256)
+    search_ratio: float = option(0.8, "best against second best distance of the same octave", gt=0, le=1)
+    local_key_frames: int = option(20, "key frames whose landmarks are looked for in a frame", ge=1)
+    relocalise_candidates: int = option(5, "key frames tried after loss, best word score first", ge=1)
+    key_frame_share: float = option(0.6, "a frame that holds less of its reference key frame's landmarks becomes one", gt=0, le=1)
+    key_frame_gap: int = option(8, "frames between key frames at most", ge=1)
+    share_key_frames: int = option(10, "neighbours in which a new key frame's landmarks are looked for", ge=0)
+    share_max_distance: int = option(50, "descriptors that differ more are not one landmark [bits]", ge=1, le=256)
+    window_key_frames: int = option(12, "key frames adjusted with each new one", ge=2)
+    window_iterations: int = option(5, "rounds of the windowed bundle adjustment", ge=1)
+
+
+@dataclass(frozen=True)
+class OptimizeConfig:
+    """Global bundle adjustment."""
+
+    enabled: bool = option(True, "false: the map passes through")
+    iterations: int = option(30, "rounds of global bundle adjustment at most", ge=1)
+    timing: bool = option(True, "find the colour image's readout time and the depth images' delay, and take both out of the measurements")
+    timing_rounds: int = option(2, "turns of adjusting the map and finding the timing", ge=1, le=10)
+    timing_prior: float = option(0.02, "how far from 0 readout time and delay are believed to be before looking [s]", gt=0, le=1)
+
+
+@dataclass(frozen=True)
+class LoopConfig:
+    """Loop closing."""
+
+    enabled: bool = option(True, "false: the map passes through")
+    rounds: int = option(3, "passes of search, correction and adjustment at most; the next begins only after new closures", ge=1)
+    candidates: int = option(3, "key frames looked at per key frame, best word score first", ge=1)
+    min_score: float = option(0.32, "similarity of word vectors that always makes a candidate; [Z] 1.3", ge=0, le=1)
+    score_share: float = option(
+        0.6, "less similar pairs are candidates from this share of the mean score of a key frame's neighbours", ge=0, le=1
+    )
+    min_shared: int = option(15, "key frames that share as many landmarks are joined already", ge=1)
+    min_matches: int = option(20, "matches under the same words that a candidate needs", ge=4)
+    min_inliers: int = option(45, "landmarks found again that an accepted closure needs; [Z] 1.3", ge=6)
+    ransac_rounds: int = option(300, "3-D to 3-D samples per candidate", ge=1)
+    ransac_threshold_px: float = option(6.0, "reprojection error of an inlier, both ways [px]", gt=0)
+    search_radius_px: float = option(4.0, "window for the landmarks around a candidate at octave 0 [px]", gt=0)
+    neighbours: int = option(10, "covisible key frames whose landmarks take part in verification and fusion", ge=0)
+    fuse_max_distance: int = option(50, "descriptors that differ more are not one landmark [bits]", ge=1, le=256)
+    edge_shared: int = option(30, "shared landmarks that make an edge of the pose graph", ge=1)
+    edges_per_key_frame: int = option(10, "such edges per key frame at most", ge=1)
+    closure_spacing: int = option(10, "key frames around both ends of a closure within which no second one is looked for", ge=0)
+    iterations: int = option(20, "rounds of each global bundle adjustment at most", ge=1)
+    hindsight: bool = option(True, "match every frame again against the final map and refine it")
+
+
+@dataclass(frozen=True)
+class SurfaceConfig:
+    """How a depth image is cleaned; densify and octree each have these options."""
+
+    noise_base: float = option(0.0012, "sigma of one reading = base + quadratic * (z - 0.4)^2, the sensor's alone [m]", gt=0)
+    noise_quadratic: float = option(0.0019, "its growth with distance [1/m]; Nguyen, Izadi, Lovell 2012 for the Kinect", ge=0)
+    edge: int = option(2, "readings at most this far from a depth jump are dropped [px]", ge=1, le=20)
+    window: float = option(2.0, "half the window that smooths a reading and gives its normal, per metre of distance [px/m]", ge=0, le=20)
+    max_angle_deg: float = option(78.0, "surfaces seen more slantingly are dropped [degrees from the normal]", gt=0, lt=90)
+
+
+@dataclass(frozen=True)
+class DensifyConfig(SurfaceConfig):
+    """The coloured cloud."""
+
+    method: str = option("voxel", "voxel averages, or a surface by Open3D (slower; mesh.ply too)", choices=("voxel", "tsdf"))
+    voxel: float = option(0.01, "voxel side of the cloud [m]", gt=0, le=1)
+    stride: int = option(2, "every stride-th row and column of a depth image is used", ge=1, le=64)
+    depth_max: float = option(4.0, "farther readings are ignored [m]", gt=0, le=100)
+    min_points: int = option(1, "voxels with fewer readings are dropped", ge=1)
+    neighbours: int = option(6, "stray points are found by their mean distance to this many neighbours; 0 keeps all", ge=0, le=100)
+    max_deviation: float = option(2.0, "and dropped when it is this many standard deviations above the mean", gt=0)
+
+
+@dataclass(frozen=True)
+class GroundConfig:
+    """The floor."""
+
+    method: str = option("robust", "lowest horizontal plane, or the paper's frequent gradients and RANSAC", choices=("robust", "paper"))
+    stride: int = option(8, "side of the blocks of pixels that are averaged to one point [px]", ge=1, le=64)
+    max_range: float = option(5.0, "farther readings are ignored [m]", gt=0, le=100)
+    distance: float = option(0.02, "inliers lie within this of the plane, twice the depth noise added [m]", gt=0, le=1)
+    min_cosine: float = option(0.94, "cosine of the tilt up to which a surface counts as horizontal", gt=0, lt=1)
+    min_patches: int = option(50, "a floor has at least this many blocks in all key frames", ge=3)
+    min_share: float = option(0.01, "and at least this share of the upward-facing blocks", ge=0, le=1)
+    max_below: float = option(0.05, "a floor has at most this share of its blocks below it", ge=0)
+    min_height: float = option(0.05, "the camera is at least this high above the floor [m]", ge=0)
+    middle: float = option(0.6, "paper: share of the image's width and height taken around its middle", gt=0, le=1)
+    gradient_bin: float = option(0.01, "paper: bin side of the gradient histogram [m]", gt=0, le=1)
+    rounds: int = option(200, "paper: RANSAC rounds", ge=1, le=100000)
+
+
+@dataclass(frozen=True)
+class OctreeConfig(SurfaceConfig):
+    """The occupancy octree."""
+
+    resolution: float = option(0.05, "leaf side [m]", gt=0, le=10)
+    frames: str = option("key", "whose depth is inserted; with all, moved objects fade sooner", choices=("key", "all"))
+    stride: int = option(4, "every stride-th row and column of a depth image is used", ge=1, le=64)
+    max_range: float = option(3.2, "rays are cut off here: a Kinect's noise reaches a third of a cell [m]", gt=0, le=1000)
+    hit: float = option(0.7, "probability of a cell in which a ray ends", gt=0.5, lt=1)
+    miss: float = option(0.4, "probability of a cell that a ray passes", gt=0, lt=0.5)
+    clamp_min: float = option(0.1192, "least probability of a cell", gt=0, lt=0.5)
+    clamp_max: float = option(0.971, "greatest probability of a cell; the lower, the sooner a moved object fades", gt=0.5, lt=1)
+    parents: str = option("max", "value of an inner node: the largest of its children, or their mean", choices=("max", "mean"))
+
+
+@dataclass(frozen=True)
+class GridConfig:
+    """The 2-D grid."""
+
+    resolution: float = option(0.05, "cell side [m]", gt=0, le=10)
+    source: str = option("points", "what the grid is made from: the key frames' depth, or the octree", choices=("points", "octree"))
+    band_low: float = option(0.05, "the robot passes over what is lower [m]", ge=0, le=10)
+    band_high: float = option(0.5, "the robot passes under what is higher [m]", gt=0, le=100)
+    spacing: float = option(0.12, "a frame is looked at when it has moved so far since the last one [m]", gt=0)
+    spacing_deg: float = option(12.0, "or turned so far [degrees]", gt=0, le=180)
+    stride: int = option(4, "every so many pixels of depth are used [px]", ge=1, le=64)
+    min_range: float = option(0.3, "nearer readings are ignored [m]", ge=0)
+    max_range: float = option(4.0, "farther readings are ignored [m]", gt=0, le=100)
+    extend_down: bool = option(True, "an upright surface that leaves the picture downwards is taken to reach the floor")
+    n_low: int = option(3, "n_l of (20): a cell with fewer points in a view is empty", ge=1)
+    n_high: int = option(8, "n_h of (20): a cell with more points in a view is occupied", ge=1)
+    update: str = option("evidence", "how views add up: log-odds, or (22), (23) as printed", choices=("evidence", "paper"))
+    p_empty_empty: float = option(0.9, "P(E1|E2) of (22)", gt=0, lt=1)
+    p_full_empty: float = option(0.1, "P(F1|E2) of (22)", gt=0, lt=1)
+    blend: float = option(0.5, "lambda of (23)", ge=0, le=1)
+    p_floor: float = option(0.01, "probabilities are kept this far from 0 and 1", gt=0, lt=0.5)
+    m_low: float = option(0.05, "m_l of (24): free below; 0.05 asks for two views, as one may be a slip", gt=0, lt=1)
+    m_high: float = option(0.6, "m_h of (24): occupied above", gt=0, lt=1)
+
+
+@dataclass(frozen=True)
+class Config:
+    """Every section."""
+
+    seed: int = option(0, "of every random draw: the same seed gives the same bytes", ge=0, le=2**63 - 1)
+    camera: dict[str, float] = field(default_factory=dict)  # what of the recording's calibration is overridden: keys of Camera
+    run: RunConfig = field(default_factory=RunConfig)
+    sensor: SensorConfig = field(default_factory=SensorConfig)
+    extract: ExtractConfig = field(default_factory=ExtractConfig)
+    match: MatchConfig = field(default_factory=MatchConfig)
+    track: TrackConfig = field(default_factory=TrackConfig)
+    optimize: OptimizeConfig = field(default_factory=OptimizeConfig)
+    loop: LoopConfig = field(default_factory=LoopConfig)
+    densify: DensifyConfig = field(default_factory=DensifyConfig)
+    ground: GroundConfig = field(default_factory=GroundConfig)
+    octree: OctreeConfig = field(default_factory=OctreeConfig)
+    grid2d: GridConfig = field(default_factory=GridConfig)

@@ -1,0 +1,208 @@
+"""Simulated recordings: a furnished room, a motion through it and a camera, written in the TUM layout with exact truth."""
+
+import json
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from slamcli.datasets.simulated import drive, noise, room
+from slamcli.datasets.simulated.drive import Motion
+from slamcli.datasets.simulated.noise import SensorNoise
+from slamcli.datasets.simulated.scene import Patch, Scene, with_textured_share
+from slamcli.datasets.staging import staged
+from slamcli.errors import SlamError
+from slamcli.formats.trajectory import read_tum, write_tum
+from slamcli.geometry.camera import Camera
+from slamcli.parallel import ordered_map
+from slamcli.schema import Trajectory
+
+FORMAT = 1  # of scene.json
+DEPTH_SCALE = 5000.0
+TEXEL_AT_640 = 0.004  # [m] finest texture pixel for images 640 px wide: what such a camera resolves at 2 m
+MAX_TEXELS = 30e6
+PATH_MARGIN = 1.35  # [m] of the robot's round from the walls
+AROUND_TRAJECTORY = 1.6  # [m] from a given trajectory to the walls
+PNG_SETTINGS = [cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_SUB]
+
+Progress = Callable[..., Iterable]
+
+
+@dataclass(frozen=True)
+class Simulation:
+    """What to simulate; lengths in metres, angles in degrees."""
+
+    seed: int = 0
+    frames: int | None = 360  # None = as many as speed, turn rate and rate give
+    laps: float = 1.09
+    speed: float = 0.6  # [m/s], at most
+    turn_rate: float = 0.8  # [rad/s], at most
+    rate: float = 15.0  # [Hz]
+    width: int = 640
+    height: int = 480
+    field_of_view: float = 62.7  # horizontal
+    camera_height: float = 0.75
+    pitch: float = -12.0  # negative looks down
+    noise: str = "kinect"  # or "none": exact images
+    depth_min: float = 0.4  # of the noisy camera
+    depth_max: float = 5.0
+    textured: float = 1.0  # share of objects and walls with a picture on them
+    movable: bool = False  # a parcel that is gone in the second half
+    alias: str = ""  # "posters": opposite walls are the same; "corridor": equal doors
+    room: tuple[float, float] = (8.0, 5.0)
+    trajectory: Path | None = None  # TUM file to follow instead of driving rounds
+    stamps: Path | None = None  # "colour depth" stamps for it
+
+    def camera(self) -> Camera:
+        """Give the camera, without distortion."""
+        focal = self.width / 2 / np.tan(np.radians(self.field_of_view) / 2)
+        return Camera(self.width, self.height, focal, focal, (self.width - 1) / 2, (self.height - 1) / 2, depth_scale=DEPTH_SCALE)
+
+
+def simulate(out: Path, *, progress: Progress, workers: int = 2, **settings: object) -> Path:
+    """Write a simulated recording into the new folder `out`; see Simulation for the settings.
+
+    The same settings give the same bytes on the same machine. The folder appears only when complete.
+    """
+    what = Simulation(**settings)  # type: ignore[arg-type]
+    _check(what)
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise SlamError(f"{out}: exists already; name a new folder")
+    scene, motion = build(what)
+    with staged(out) as staging:
+        (staging / "rgb").mkdir()
+        (staging / "depth").mkdir()
+        _write_lists(staging, what, scene, motion)
+        _write_images(staging, what, scene, motion, progress, workers)
+    return out
+
+
+def build(what: Simulation) -> tuple[Scene, Motion]:
+    """Make the motion and a room around it."""
+    if what.trajectory is not None:
+        return _around_trajectory(what, what.trajectory)
+    low, high = np.zeros(3), np.array([*what.room, room.HEIGHT])
+    margin = PATH_MARGIN
+    if what.alias == "corridor":
+        high, margin = np.array([16.0, 2.4, room.HEIGHT]), 0.75
+    rng = np.random.default_rng([what.seed, 2])
+    path = drive.closed_path(low, high, margin, rng)
+    motion = drive.rounds(path, frames=what.frames, speed=what.speed, turn_rate=what.turn_rate, rate=what.rate, laps=what.laps,
+                          height=what.camera_height, pitch=np.radians(what.pitch), rng=rng)  # fmt: skip
+    if what.alias == "corridor":
+        return room.corridor(low, high, seed=what.seed), motion
+    centres = np.column_stack([path, np.zeros(len(path))])  # the robot itself is on the floor
+    return room.furnished_room(low, high, centres, seed=what.seed, twins=what.alias == "posters", movable=what.movable), motion
+
+
+def _around_trajectory(what: Simulation, trajectory: Path) -> tuple[Scene, Motion]:
+    """Follow a recorded trajectory through a room made large enough for it; its z axis must point up, as in the TUM data set."""
+    followed = read_tum(trajectory)
+    lift = max(0.0, 0.4 - float(followed.T_wc[:, 2, 3].min()))
+    T_lw = np.eye(4)
+    T_lw[2, 3] = lift
+    followed = Trajectory(stamp=followed.stamp, T_wc=T_lw @ followed.T_wc)
+    stamps = _read_stamps(what.stamps) if what.stamps is not None else None
+    motion = drive.along(followed, stamps, rate=what.rate, frames=what.frames)
+    centres = np.concatenate([motion.colour_T_lc[:, :3, 3], motion.depth_T_lc[:, :3, 3]])
+    low, high = centres.min(axis=0) - AROUND_TRAJECTORY, centres.max(axis=0) + AROUND_TRAJECTORY
+    for axis, least in enumerate((5.0, 4.0)):
+        lacking = max(0.0, least - (high[axis] - low[axis])) / 2
+        low[axis], high[axis] = low[axis] - lacking, high[axis] + lacking
+    low[2], high[2] = 0.0, max(room.HEIGHT, float(centres[:, 2].max()) + 0.5)
+    return room.furnished_room(low, high, centres, seed=what.seed, twins=what.alias == "posters", movable=what.movable), motion
+
+
+def _read_stamps(path: Path) -> np.ndarray:
+    """Read lines ``colour_stamp depth_stamp``."""
+    expected = f"{path}: expected lines 'colour_stamp depth_stamp'"
+    try:
+        lines = [line.split("#")[0].split() for line in path.read_text(encoding="utf-8", errors="replace").splitlines()]
+        rows = np.array([[float(token) for token in line] for line in lines if line])
+    except OSError as error:
+        raise SlamError(f"{path}: cannot be read ({error.strerror})") from error
+    except ValueError as error:
+        raise SlamError(f"{expected} ({error})") from error
+    if rows.ndim != 2 or rows.shape[1] != 2 or not np.isfinite(rows).all():
+        raise SlamError(expected)
+    return rows[np.unique(rows[:, 0], return_index=True)[1]]
+
+
+def _check(what: Simulation) -> None:
+    bounds = {
+        "frames": (1, 1_000_000), "laps": (0.01, 1000), "speed": (0.001, 100), "turn_rate": (0.001, 100), "rate": (0.1, 1000),
+        "width": (32, 4096), "height": (32, 4096), "field_of_view": (20, 120), "camera_height": (0.1, 2.4), "pitch": (-80, 80),
+        "depth_min": (0, 10), "depth_max": (0.1, 13), "textured": (0, 1), "seed": (0, 2**31),
+    }  # fmt: skip
+    for name, (least, most) in bounds.items():
+        value = getattr(what, name)
+        if value is not None and not least <= value <= most:
+            raise SlamError(f"{name} = {value}: must be from {least} to {most}")
+    if what.noise not in ("kinect", "none") or what.alias not in ("", "posters", "corridor"):
+        raise SlamError(f"noise = {what.noise!r}, alias = {what.alias!r}: known are noise kinect, none and alias posters, corridor")
+    if what.depth_min >= what.depth_max:
+        raise SlamError(f"depth_min = {what.depth_min}, depth_max = {what.depth_max}: the first must be smaller")
+    if min(what.room) < 4.0 or max(what.room) > 50.0:
+        raise SlamError(f"room = {what.room}: sides must be from 4 to 50 m")
+
+
+def _write_lists(folder: Path, what: Simulation, scene: Scene, motion: Motion) -> None:
+    for kind, stamps in (("rgb", motion.colour_stamp), ("depth", motion.depth_stamp)):
+        lines = [f"{stamp:.6f} {kind}/{stamp:.6f}.png\n" for stamp in stamps]
+        (folder / f"{kind}.txt").write_text(f"# simulated {kind} images\n# timestamp filename\n" + "".join(lines))
+    stamp, first = np.unique(np.concatenate([motion.colour_stamp, motion.depth_stamp]), return_index=True)
+    poses = np.concatenate([motion.colour_T_lc, motion.depth_T_lc])[first]
+    write_tum(folder / "groundtruth.txt", Trajectory(stamp=stamp, T_wc=poses))
+    (folder / "camera.json").write_text(json.dumps(what.camera().to_dict(), indent=1) + "\n")
+    gone_from = float(motion.colour_stamp[len(motion.colour_stamp) // 2]) if what.movable else None
+    about = {
+        "format": FORMAT,
+        "frame": "level: z up, floor z = 0, metres, radians; groundtruth.txt maps the colour camera to it",
+        "seed": what.seed,
+        "noise": what.noise,
+        **scene.to_dict(),
+        "gone": [{"name": solid.name, "from": gone_from} for solid in scene.solids if solid.is_movable],
+    }
+    (folder / "scene.json").write_text(json.dumps(about, indent=1) + "\n")
+
+
+def _write_images(folder: Path, what: Simulation, scene: Scene, motion: Motion, progress: Progress, workers: int) -> None:
+    from slamcli.datasets.simulated.raycast import Renderer
+
+    patches = with_textured_share(scene.patches(), what.textured, what.seed)
+    renderer = Renderer(patches, scene, what.camera(), texel=_texel(patches, what.width))
+    n = len(motion.colour_stamp)
+    has_one_clock = np.array_equal(motion.colour_stamp, motion.depth_stamp)
+    sensor = replace(SensorNoise(), near=what.depth_min, far=what.depth_max)
+    normal_noise = noise.NormalNoise((what.height, what.width), what.seed)
+
+    def one(i: int) -> None:
+        rng = np.random.default_rng([what.seed, 3, i])
+        shown = i < n // 2
+        rgb, depth, cosine = renderer.render(motion.colour_T_lc[i], with_movable=shown)
+        if not has_one_clock:
+            depth, cosine = renderer.depth(motion.depth_T_lc[i], with_movable=shown)
+        if what.noise == "kinect":
+            depth = noise.depth_noise(depth, cosine, what.camera().fx, sensor, normal_noise, rng)
+            picture = noise.colour_noise(rgb, sensor, normal_noise, rng)
+        else:
+            picture = np.clip(rgb + 0.5, 0, 255).astype(np.uint8)
+        units = np.round(depth.astype(np.float64) * DEPTH_SCALE)
+        units[units > np.iinfo(np.uint16).max] = 0
+        _write_png(folder / "rgb" / f"{motion.colour_stamp[i]:.6f}.png", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
+        _write_png(folder / "depth" / f"{motion.depth_stamp[i]:.6f}.png", units.astype(np.uint16))
+
+    for _ in progress(ordered_map(one, range(n), workers=workers), "simulate", n):
+        pass
+
+
+def _texel(patches: list[Patch], width: int) -> float:
+    area = sum(np.linalg.norm(patch.a) * np.linalg.norm(patch.b) for patch in patches)
+    return max(TEXEL_AT_640 * 640 / width, float(np.sqrt(area / MAX_TEXELS)))
+
+
+def _write_png(path: Path, image: np.ndarray) -> None:
+    _, data = cv2.imencode(".png", image, PNG_SETTINGS)
+    path.write_bytes(data.tobytes())

@@ -1,0 +1,138 @@
+"""Motions through a simulated room: a robot's rounds, or a trajectory recorded elsewhere."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from slamcli.errors import SlamError
+from slamcli.geometry import se3
+from slamcli.schema import Trajectory
+
+DENSE = 4000  # points of a closed path
+
+
+@dataclass(frozen=True)
+class Motion:
+    """When each image is taken and where the camera is then (T_lc: camera to level frame)."""
+
+    colour_stamp: np.ndarray  # (F,) [s]
+    colour_T_lc: np.ndarray  # (F, 4, 4)
+    depth_stamp: np.ndarray  # (F,) [s]
+    depth_T_lc: np.ndarray  # (F, 4, 4)
+
+
+def closed_path(low: np.ndarray, high: np.ndarray, margin: float, rng: np.random.Generator) -> np.ndarray:
+    """Give a smooth closed path (DENSE, 2), `margin` from the walls: a superellipse with slight waves, counter-clockwise."""
+    half = (high[:2] - low[:2]) / 2 - margin
+    angle = np.linspace(0.0, 2 * np.pi, DENSE, endpoint=False) + rng.uniform(0, 2 * np.pi)
+    wave = np.sum([rng.uniform(-0.02, 0.02) * np.cos(k * angle + rng.uniform(0, 2 * np.pi)) for k in (2, 3, 5)], axis=0)
+    power = 0.55  # 1 an ellipse, 0 a rectangle
+    round_ = np.stack(
+        [np.sign(np.cos(angle)) * np.abs(np.cos(angle)) ** power, np.sign(np.sin(angle)) * np.abs(np.sin(angle)) ** power], axis=1
+    )
+    path = (low[:2] + high[:2]) / 2 + half * round_ * (1.0 + wave)[:, None]
+    return _smooth_closed(_even(path), 0.04)
+
+
+def rounds(
+    path: np.ndarray, *, frames: int | None, speed: float, turn_rate: float, rate: float, laps: float, height: float, pitch: float,
+    rng: np.random.Generator,
+) -> Motion:  # fmt: skip
+    """Drive along a closed path.
+
+    frames : number of images; None = as many as `speed` [m/s] and `turn_rate` [rad/s], at most, take at `rate` [Hz]
+    laps : rounds, any fraction
+    height, pitch : of the camera [m], [rad], positive up; the robot rocks by some millimetres and tenths of a degree
+    """
+    step = np.roll(path, -1, axis=0) - path
+    length = np.linalg.norm(step, axis=1)
+    heading = np.unwrap(np.arctan2(step[:, 1], step[:, 0]))
+    turn = np.abs(np.diff(heading, append=heading[0] + 2 * np.pi * np.round((heading[-1] - heading[0]) / (2 * np.pi))))
+    seconds = _smooth_closed(np.hypot(length / speed, turn / turn_rate)[:, None], 0.02)[:, 0]
+    clock = np.concatenate([[0.0], np.cumsum(seconds)])  # at each point of the path, over one lap
+    total = laps * clock[-1]
+    n = frames if frames is not None else max(2, round(total * rate) + 1)
+    when = np.linspace(0.0, total, n)
+    share = np.interp(when % clock[-1], clock, np.arange(DENSE + 1) / DENSE) + when // clock[-1]
+    xy, psi = _at(path, share), _heading_at(path, share)
+    wobble = [_sway(share, rng) for _ in range(5)]
+    side = np.stack([-np.sin(psi), np.cos(psi)], axis=1)
+    position = np.column_stack([xy + 0.03 * wobble[0][:, None] * side, height + 0.003 * wobble[1]])
+    look = psi + 0.12 * np.sin(2 * np.pi * (3 * share + rng.random()))
+    T_lc = look_along(position, look + 0.01 * wobble[2], pitch + 0.005 * wobble[3], 0.005 * wobble[4])
+    stamp = np.round(np.arange(n) / rate, 6)
+    return Motion(stamp, T_lc, stamp, T_lc)
+
+
+def _sway(share: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Give smooth values of about -1..1 that differ from lap to lap."""
+    waves = [rng.normal() * np.sin(2 * np.pi * (f * share + rng.random())) / 2 for f in (1.7, 4.3, 11.1)]
+    return np.sum(waves, axis=0)
+
+
+def look_along(position: np.ndarray, heading: np.ndarray, pitch: np.ndarray | float, roll: np.ndarray | float) -> np.ndarray:
+    """Give T_lc (N, 4, 4) of cameras at (N, 3) that look along a heading [rad], pitched up and rolled clockwise."""
+    heading, pitch, roll = np.broadcast_arrays(heading, pitch, roll)
+    forward = np.stack([np.cos(heading) * np.cos(pitch), np.sin(heading) * np.cos(pitch), np.sin(pitch)], axis=1)
+    right = np.stack([np.sin(heading), -np.cos(heading), np.zeros(len(heading))], axis=1)
+    down = np.cross(forward, right)
+    c, s = np.cos(roll)[:, None], np.sin(roll)[:, None]
+    T = np.tile(np.eye(4), (len(heading), 1, 1))
+    T[:, :3, 0], T[:, :3, 1], T[:, :3, 2], T[:, :3, 3] = c * right + s * down, c * down - s * right, forward, position
+    return T
+
+
+def along(trajectory: Trajectory, stamps: np.ndarray | None, *, rate: float, frames: int | None) -> Motion:
+    """Follow a trajectory.
+
+    stamps : (F, 2) colour and depth stamps [s]; None = both at `rate` [Hz] over the whole trajectory
+    frames : at most so many; None = all
+
+    Stamps outside the trajectory are left out; an error if none is inside.
+    """
+    first, last = trajectory.stamp[0], trajectory.stamp[-1]
+    if stamps is None:
+        even = np.round(np.arange(first, last, 1.0 / rate), 6)
+        stamps = np.column_stack([even, even])
+    stamps = stamps[((stamps >= first) & (stamps <= last)).all(axis=1)][:frames]
+    if len(stamps) == 0:
+        raise SlamError(f"no stamp lies within the trajectory, which lasts from {first:.6f} to {last:.6f}")
+    colour, depth = np.ascontiguousarray(stamps.T)
+    return Motion(colour, interpolate(trajectory, colour), depth, interpolate(trajectory, depth))
+
+
+def interpolate(trajectory: Trajectory, stamp: np.ndarray) -> np.ndarray:
+    """Give the poses (N, 4, 4) at stamps within the trajectory."""
+    if len(trajectory.stamp) == 1:
+        return np.tile(trajectory.T_wc[0], (len(stamp), 1, 1))
+    after = np.searchsorted(trajectory.stamp, stamp).clip(1, len(trajectory.stamp) - 1)
+    before = after - 1
+    alpha = (stamp - trajectory.stamp[before]) / (trajectory.stamp[after] - trajectory.stamp[before])
+    return se3.interpolate(trajectory.T_wc[before], trajectory.T_wc[after], alpha)
+
+
+def _even(path: np.ndarray) -> np.ndarray:
+    """Resample a closed path at even arc length."""
+    closed = np.concatenate([path, path[:1]])
+    arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1))])
+    at = np.linspace(0.0, arc[-1], len(path), endpoint=False)
+    return np.stack([np.interp(at, arc, closed[:, k]) for k in range(2)], axis=1)
+
+
+def _smooth_closed(values: np.ndarray, share: float) -> np.ndarray:
+    """Smooth a periodic signal (N, k) with a Gaussian whose sigma is a share of the period."""
+    n = len(values)
+    frequency = np.fft.rfftfreq(n, d=1.0 / n)
+    gain = np.exp(-0.5 * (2 * np.pi * frequency * share) ** 2)
+    return np.fft.irfft(np.fft.rfft(values, axis=0) * gain[:, None], n=n, axis=0)
+
+
+def _at(path: np.ndarray, share: np.ndarray) -> np.ndarray:
+    """Give the points (N, 2) at shares of the closed path's length."""
+    grid = np.arange(DENSE + 1) / DENSE
+    return np.stack([np.interp(share % 1.0, grid, np.append(path[:, k], path[0, k])) for k in range(2)], axis=1)
+
+
+def _heading_at(path: np.ndarray, share: np.ndarray, ahead: float = 0.005) -> np.ndarray:
+    step = _at(path, share + ahead) - _at(path, share - ahead)
+    return np.arctan2(step[:, 1], step[:, 0])

@@ -1,0 +1,222 @@
+"""PLY and PCD point clouds, and PLY meshes. Readers take what this and other programs write; coordinates are metres."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from slamcli.errors import SlamError
+
+Points = tuple[np.ndarray, np.ndarray | None, np.ndarray | None]  # xyz (N, 3) float32, rgb (N, 3) uint8, normal (N, 3) float32
+
+PLY_TYPE = {
+    "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4", "double": "f8",
+    "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4", "float32": "f4", "float64": "f8",
+}  # fmt: skip
+PLY_NAME = {"f4": "float", "u1": "uchar"}
+MAX_HEADER = 65536  # bytes
+MAX_POINTS = 1 << 30
+
+
+def write(path: Path, xyz: np.ndarray, rgb: np.ndarray | None = None, normal: np.ndarray | None = None) -> None:
+    """Write points (N, 3), colours (N, 3) uint8 and normals (N, 3) in the format that the suffix names, .ply or .pcd."""
+    _by_suffix(path, {".ply": write_ply, ".pcd": write_pcd})(path, xyz, rgb, normal)
+
+
+def read(path: Path) -> Points:
+    """Read a .ply or .pcd file: points, and colours and normals where it has them."""
+    return _by_suffix(path, {".ply": read_ply, ".pcd": read_pcd})(path)
+
+
+def _by_suffix(path: Path, functions: dict[str, Callable]) -> Callable:
+    suffix = Path(path).suffix.lower()
+    if suffix not in functions:
+        raise SlamError(f"{path}: a point cloud's name ends in {' or '.join(functions)}")
+    return functions[suffix]
+
+
+def write_ply(path: Path, xyz: np.ndarray, rgb: np.ndarray | None = None, normal: np.ndarray | None = None) -> None:
+    """Write points as binary little-endian PLY."""
+    vertex = _vertices(xyz, rgb, normal)
+    with open(path, "wb") as file:
+        file.write(_ply_header(vertex, n_faces=None))
+        file.write(vertex.tobytes())
+
+
+def write_ply_mesh(
+    path: Path, xyz: np.ndarray, triangle: np.ndarray, rgb: np.ndarray | None = None, normal: np.ndarray | None = None
+) -> None:
+    """Write a mesh as binary little-endian PLY: vertices as in `write_ply`, triangles (M, 3) of vertex rows."""
+    vertex = _vertices(xyz, rgb, normal)
+    face = np.empty(len(triangle), dtype=[("n", "u1"), ("vertex", "<i4", 3)])
+    face["n"], face["vertex"] = 3, triangle
+    with open(path, "wb") as file:
+        file.write(_ply_header(vertex, n_faces=len(face)))
+        file.write(vertex.tobytes())
+        file.write(face.tobytes())
+
+
+def _vertices(xyz: np.ndarray, rgb: np.ndarray | None, normal: np.ndarray | None) -> np.ndarray:
+    groups = [("x y z", "f4", xyz), ("nx ny nz", "f4", normal), ("red green blue", "u1", rgb)]
+    present = [(names.split(), kind, value) for names, kind, value in groups if value is not None]
+    out = np.empty(len(xyz), dtype=np.dtype([(name, kind) for names, kind, _ in present for name in names]).newbyteorder("<"))
+    for names, _, value in present:
+        for i, name in enumerate(names):
+            out[name] = value[:, i]
+    return out
+
+
+def _ply_header(vertex: np.ndarray, *, n_faces: int | None) -> bytes:
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertex)}"]
+    lines += [f"property {PLY_NAME[kind[1:]]} {name}" for name, kind in vertex.dtype.descr]
+    if n_faces is not None:
+        lines += [f"element face {n_faces}", "property list uchar int vertex_indices"]
+    return "\n".join([*lines, "end_header", ""]).encode()
+
+
+def read_ply(path: Path) -> Points:
+    """Read the vertices of an ASCII or binary PLY file; SlamError for one that is not what its header says."""
+    with open(path, "rb") as file:
+        layout, dtype, n = _read_ply_header(path, file)
+        if layout == "ascii":
+            return _points(path, _read_text(path, file, dtype, n))
+        return _points(path, _read_records(path, file, dtype, n))
+
+
+def _read_ply_header(path: Path, file: BinaryIO) -> tuple[str, np.dtype, int]:
+    """Read up to the vertices; gives the format, the type of a vertex and their number."""
+    lines = _header_lines(path, file, first="ply", last="end_header", kind="PLY")
+    layout = next((words[1] for words in lines if words[0] == "format" and len(words) > 1), "")
+    if layout not in ("ascii", "binary_little_endian", "binary_big_endian"):
+        raise SlamError(f"{path}: the PLY format {layout[:40]!r} is not known")
+    elements = [words for words in lines if words[0] == "element"]
+    if not elements or elements[0][1:2] != ["vertex"] or len(elements[0]) != 3:
+        raise SlamError(f"{path}: the first element of the PLY file is not 'vertex'")
+    n = _count(path, elements[0][2], "vertices")
+    fields = []
+    for words in lines[lines.index(elements[0]) + 1 :]:
+        if words[0] == "element":
+            break
+        if words[0] == "property":
+            if len(words) != 3 or words[1] not in PLY_TYPE:
+                raise SlamError(f"{path}: the vertex property {' '.join(words[1:])[:60]!r} cannot be read")
+            fields.append((words[2], PLY_TYPE[words[1]]))
+    order = ">" if layout == "binary_big_endian" else "<"
+    return layout, _record_type(path, fields, order), n
+
+
+def write_pcd(path: Path, xyz: np.ndarray, rgb: np.ndarray | None = None, normal: np.ndarray | None = None) -> None:
+    """Write points as binary PCD v0.7, the colour packed in a float as the Point Cloud Library does."""
+    groups = [("x y z", xyz), ("normal_x normal_y normal_z", normal)]
+    columns = [(name, value[:, i]) for names, value in groups if value is not None for i, name in enumerate(names.split())]
+    if rgb is not None:
+        red, green, blue = rgb.astype(np.uint32).T
+        columns.append(("rgb", (red << 16 | green << 8 | blue).view(np.float32)))
+    point = np.empty(len(xyz), dtype=[(name, "<f4") for name, _ in columns])
+    for name, value in columns:
+        point[name] = value
+    k = len(columns)
+    header = (
+        "# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\n"
+        f"FIELDS {' '.join(point.dtype.names)}\nSIZE{' 4' * k}\nTYPE{' F' * k}\nCOUNT{' 1' * k}\n"
+        f"WIDTH {len(point)}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {len(point)}\nDATA binary\n"
+    )
+    with open(path, "wb") as file:
+        file.write(header.encode())
+        file.write(point.tobytes())
+
+
+def read_pcd(path: Path) -> Points:
+    """Read an ASCII or binary PCD file; SlamError for one that is not what its header says."""
+    with open(path, "rb") as file:
+        lines = _header_lines(path, file, first="", last="DATA", kind="PCD")
+        header = {words[0]: words[1:] for words in lines}
+        names = header.get("FIELDS", [])
+        kinds = ["".join(pair) for pair in zip(_letters(header.get("TYPE", [])), header.get("SIZE", []), strict=False)]
+        counts = header.get("COUNT", ["1"] * len(names))
+        if not names or len(kinds) != len(names) or counts != ["1"] * len(names):
+            raise SlamError(f"{path}: the PCD header's FIELDS, SIZE, TYPE and COUNT do not describe single numbers")
+        n = _count(path, " ".join(header.get("POINTS", [])), "points")
+        layout = " ".join(header["DATA"])
+        dtype = _record_type(path, list(zip(names, kinds, strict=True)), "<")
+        if layout == "ascii":
+            return _points(path, _read_text(path, file, dtype, n))
+        if layout != "binary":
+            raise SlamError(f"{path}: PCD data of type {layout[:40]!r} cannot be read; convert it with: pcl_convert_pcd_ascii_binary")
+        return _points(path, _read_records(path, file, dtype, n))
+
+
+def _letters(types: list[str]) -> list[str]:
+    return [{"F": "f", "U": "u", "I": "i"}.get(letter, "?") for letter in types]
+
+
+def _header_lines(path: Path, file: BinaryIO, *, first: str, last: str, kind: str) -> list[list[str]]:
+    """Read lines as words up to the one that starts with `last`, without comments; the file stands behind it."""
+    lines: list[list[str]] = []
+    used = 0
+    while used < MAX_HEADER:
+        line = file.readline(MAX_HEADER - used)
+        used += len(line)
+        words = line.decode("latin-1").split()
+        if (first and used == len(line) and words != [first]) or not line:
+            break
+        if words and not words[0].startswith("#") and words[0] not in ("comment", "obj_info"):
+            lines.append(words)
+        if words and words[0] == last:
+            return lines
+    raise SlamError(f"{path}: is not a {kind} file, or its header is cut off")
+
+
+def _count(path: Path, text: str, what: str) -> int:
+    if not text.isdecimal() or int(text) > MAX_POINTS:
+        raise SlamError(f"{path}: the header gives {text[:40]!r} as the number of {what}")
+    return int(text)
+
+
+def _record_type(path: Path, fields: list[tuple[str, str]], order: str) -> np.dtype:
+    names = [name for name, _ in fields]
+    if len(set(names)) != len(names) or not {"x", "y", "z"} <= set(names):
+        raise SlamError(f"{path}: the points have no x, y and z, or a field twice")
+    try:
+        return np.dtype(fields).newbyteorder(order)
+    except TypeError:
+        raise SlamError(f"{path}: the header gives a field a type that is not known") from None
+
+
+def _read_records(path: Path, file: BinaryIO, dtype: np.dtype, n: int) -> dict[str, np.ndarray]:
+    here = file.tell()
+    available = file.seek(0, 2) - here
+    if n * dtype.itemsize > available:  # checked before anything of that size is reserved
+        raise SlamError(f"{path}: is cut off: {n} points need {n * dtype.itemsize} bytes, {available} are there")
+    file.seek(here)
+    records = np.frombuffer(file.read(n * dtype.itemsize), dtype=dtype)
+    return {name: records[name] for name in dtype.names}
+
+
+def _read_text(path: Path, file: BinaryIO, dtype: np.dtype, n: int) -> dict[str, np.ndarray]:
+    words, names = file.read().split(), dtype.names
+    if n * len(names) > len(words):
+        raise SlamError(f"{path}: is cut off: {n} points need {n * len(names)} numbers, {len(words)} are there")
+    try:
+        table = np.array(words[: n * len(names)], dtype=np.float64).reshape(n, len(names))
+    except ValueError:
+        raise SlamError(f"{path}: holds something that is not a number") from None
+    return {name: table[:, i].astype(dtype[name]) for i, name in enumerate(names)}
+
+
+def _points(path: Path, columns: dict[str, np.ndarray]) -> Points:
+    def group(names: str, dtype: type) -> np.ndarray | None:
+        present = [columns.get(name) for name in names.split()]
+        return None if any(column is None for column in present) else np.column_stack(present).astype(dtype)
+
+    xyz = group("x y z", np.float32)
+    if not np.isfinite(xyz).all():
+        raise SlamError(f"{path}: holds a point that is not finite")
+    rgb = group("red green blue", np.uint8)
+    packed = columns.get("rgb")
+    if packed is not None:
+        bits = packed.astype(np.float32).view(np.uint32) if packed.dtype.kind == "f" else packed.astype(np.uint32)
+        rgb = np.column_stack([bits >> 16 & 255, bits >> 8 & 255, bits & 255]).astype(np.uint8)
+    normal = group("nx ny nz", np.float32)
+    return xyz, rgb, normal if normal is not None else group("normal_x normal_y normal_z", np.float32)

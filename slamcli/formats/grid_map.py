@@ -1,0 +1,139 @@
+"""map_server's grid map: a picture (PGM) and a YAML page beside it.
+
+Row 0 of the picture is the largest y; row 0 of an array here is the smallest. The flip happens in this file and nowhere else.
+"""
+
+import math
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from slamcli.errors import SlamError
+
+OCCUPIED, FREE, UNKNOWN = 1, 0, -1
+GREY = {OCCUPIED: 0, FREE: 254, UNKNOWN: 205}
+FREE_THRESH = 0.196  # 205 reads as (255 - 205) / 255 = 0.1961: not free; with nav2's default of 0.25 unknown cells would load as free
+OCCUPIED_THRESH = 0.65
+MAX_PIXELS = 1 << 28
+MAX_PAGE = 1 << 16  # bytes of a YAML page; a real one has some 150
+PGM_WORD = re.compile(rb"#[^\n]*|[^\s#]{1,12}")
+KEYS = ("image", "mode", "resolution", "origin", "negate", "occupied_thresh", "free_thresh")
+
+
+@dataclass(frozen=True)
+class GridMap:
+    """A decided grid."""
+
+    state: np.ndarray  # (H, W) int8: 1 occupied, 0 free, -1 unknown; row 0 is the smallest y
+    origin: tuple[float, float]  # m, outer corner of cell (0, 0)
+    resolution: float  # m, side of a cell
+
+
+def write(path: Path, grid: GridMap) -> tuple[Path, Path]:
+    """Write `path` (.pgm) and the YAML page of the same name beside it; returns both paths."""
+    path = Path(path)
+    if path.suffix != ".pgm":
+        raise SlamError(f"{path}: a grid map's name ends in .pgm; its page map.yaml is written beside it")
+    picture = np.full(grid.state.shape, GREY[UNKNOWN], dtype=np.uint8)
+    for state in (OCCUPIED, FREE):
+        picture[grid.state == state] = GREY[state]
+    rows, columns = grid.state.shape
+    x, y = float(grid.origin[0]), float(grid.origin[1])
+    page = path.with_suffix(".yaml")
+    text = (
+        f"image: {_quoted(path.name)}\nmode: trinary\nresolution: {grid.resolution!r}\norigin: [{x!r}, {y!r}, 0.0]\n"
+        f"negate: 0\noccupied_thresh: {OCCUPIED_THRESH}\nfree_thresh: {FREE_THRESH}\n"
+    )
+    try:
+        path.write_bytes(b"P5\n%d %d\n255\n" % (columns, rows) + picture[::-1].tobytes())
+        page.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise SlamError(f"{error.filename or path}: cannot be written ({error.strerror}); choose another place") from error
+    return path, page
+
+
+def _quoted(name: str) -> str:
+    return name if re.fullmatch(r"[A-Za-z_][\w.-]*", name) else '"' + name.replace("\\", "\\\\").replace('"', '\\"') + '"'
+
+
+def read(path: Path) -> GridMap:
+    """Read a grid map from its YAML page, as map_server reads it in mode `trinary`.
+
+    Raises SlamError for a page or a picture that is not one, for a turned map and for an image outside the page's folder.
+    """
+    path = Path(path)
+    keys = _page(path)
+    resolution, occupied_thresh, free_thresh = (_number(path, keys, name) for name in ("resolution", "occupied_thresh", "free_thresh"))
+    origin = [_as_number(path, "origin", text) for text in keys["origin"].strip("[] ").split(",")]
+    if len(origin) != 3 or origin[2] != 0.0:
+        raise SlamError(f"{path}: origin {keys['origin']}: must be [x, y, 0.0]; a turned map cannot be read")
+    if not 1e-4 <= resolution <= 1e3:
+        raise SlamError(f"{path}: resolution {resolution:g}: must be the side of a cell in metres")
+    if keys["mode"] != "trinary":
+        raise SlamError(f"{path}: mode {keys['mode']!r} cannot be read, only trinary")
+    if Path(keys["image"]).name != keys["image"]:
+        raise SlamError(f"{path}: image {keys['image']!r}: must be the name of a file in the same folder")
+    picture = read_pgm(path.parent / keys["image"]).astype(np.float64)
+    occupied = picture / 255.0 if _number(path, keys, "negate") else (255.0 - picture) / 255.0
+    state = np.full(picture.shape, UNKNOWN, dtype=np.int8)
+    state[occupied > occupied_thresh] = OCCUPIED
+    state[occupied < free_thresh] = FREE
+    return GridMap(np.ascontiguousarray(state[::-1]), (origin[0], origin[1]), resolution)
+
+
+def _page(path: Path) -> dict[str, str]:
+    """Read the page's `key: value` lines; values stay text. No YAML beyond that is used in such pages."""
+    try:
+        if path.stat().st_size > MAX_PAGE:
+            raise SlamError(f"{path}: too long to be the page of a grid map")
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise SlamError(f"{path}: cannot be read as the page of a grid map; name the .yaml file") from error
+    keys = {"mode": "trinary", "negate": "0"}
+    for line in lines:
+        name, colon, value = line.partition(":")
+        if colon and name.strip() in KEYS:
+            value = value.strip()
+            keys[name.strip()] = (
+                value[1:-1] if value[:1] == value[-1:] and value[:1] in "'\"" and len(value) > 1 else value.split(" #")[0].strip()
+            )
+    for name in KEYS:
+        if name not in keys:
+            raise SlamError(f"{path}: {name!r} is missing; not the page of a grid map")
+    return keys
+
+
+def _number(path: Path, keys: dict[str, str], name: str) -> float:
+    return _as_number(path, name, keys[name])
+
+
+def _as_number(path: Path, name: str, text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise SlamError(f"{path}: {name} {text[:40]!r}: not a number")
+    return value
+
+
+def read_pgm(path: Path) -> np.ndarray:
+    """Read a binary PGM of 8 bits as (H, W) uint8, row 0 at the top."""
+    try:
+        with open(path, "rb") as file:
+            head = file.read(4096)
+            words = [word for word in PGM_WORD.finditer(head) if not word[0].startswith(b"#")][:4]
+            if len(words) < 4 or words[0][0] != b"P5" or words[3][0] != b"255" or not all(w[0].isdigit() for w in words[1:]):
+                raise SlamError(f"{path}: not a binary PGM picture of 8 bits")
+            columns, rows = int(words[1][0]), int(words[2][0])
+            if not 1 <= rows * columns <= MAX_PIXELS:
+                raise SlamError(f"{path}: {columns} x {rows} pixels: not a size a map can have")
+            file.seek(words[3].end() + 1)  # one white space ends the header
+            data = file.read(rows * columns)
+    except OSError as error:
+        raise SlamError(f"{path}: cannot be read ({error.strerror})") from error
+    if len(data) < rows * columns:
+        raise SlamError(f"{path}: cut off: {len(data)} of {rows * columns} pixels are there; write the map again")
+    return np.frombuffer(data, dtype=np.uint8).reshape(rows, columns)

@@ -1,0 +1,129 @@
+"""Voxel keys in Morton order, and a hash from keys to rows of growing arrays.
+
+A Morton key interleaves the bits of three non-negative cell numbers, x lowest: sorting by it keeps neighbours together, and eight
+consecutive keys are the children of one octree node. Keys are kept in int64, as 3 * 21 bits fit and mixing uint64 with int64 gives floats.
+"""
+
+import numpy as np
+from numba import njit
+
+from slamcli.errors import SlamError
+
+AXIS_BITS = 21  # per axis in a Morton key
+GOLDEN = -7046029254386353131  # 2^64 / golden ratio as int64: Fibonacci hashing, Knuth, TAOCP 3, section 6.4
+
+
+def _spread(x):
+    """Put two zero bits between the lowest 21 bits of an int64."""
+    x = x & 0x1FFFFF
+    x = (x | (x << 32)) & 0x1F00000000FFFF
+    x = (x | (x << 16)) & 0x1F0000FF0000FF
+    x = (x | (x << 8)) & 0x100F00F00F00F00F
+    x = (x | (x << 4)) & 0x10C30C30C30C30C3
+    return (x | (x << 2)) & 0x1249249249249249
+
+
+def _gather(x):
+    """Undo `spread`: collect every third bit."""
+    x = x & 0x1249249249249249
+    x = (x ^ (x >> 2)) & 0x10C30C30C30C30C3
+    x = (x ^ (x >> 4)) & 0x100F00F00F00F00F
+    x = (x ^ (x >> 8)) & 0x1F0000FF0000FF
+    x = (x ^ (x >> 16)) & 0x1F00000000FFFF
+    return (x ^ (x >> 32)) & 0x1FFFFF
+
+
+spread = njit(cache=True, nogil=True)(_spread)
+gather = njit(cache=True, nogil=True)(_gather)
+
+
+def morton(cell: np.ndarray) -> np.ndarray:
+    """Give the Morton keys (N,) int64 of cells (N, 3), each number in [0, 2^21)."""
+    cell = np.asarray(cell, dtype=np.int64)
+    return _spread(cell[..., 0]) | _spread(cell[..., 1]) << 1 | _spread(cell[..., 2]) << 2
+
+
+def unmorton(key: np.ndarray) -> np.ndarray:
+    """Give the cells (N, 3) int64 of Morton keys (N,)."""
+    key = np.asarray(key, dtype=np.int64)
+    return np.stack([_gather(key), _gather(key >> 1), _gather(key >> 2)], axis=-1)
+
+
+@njit(cache=True, nogil=True)
+def first_slot(key, mask):
+    """Give the slot a key's search starts at; the eight children of a node share a cache line."""
+    return (((key >> 3) * GOLDEN >> 32) + (key & 7)) & mask
+
+
+@njit(cache=True, nogil=True)
+def find_row(slot_row, row_key, key):
+    """Give the row of a key, -1 where it has none."""
+    mask = slot_row.size - 1
+    slot = first_slot(key, mask)
+    while slot_row[slot] >= 0:
+        if row_key[slot_row[slot]] == key:
+            return slot_row[slot]
+        slot = (slot + 1) & mask
+    return -1
+
+
+@njit(cache=True, nogil=True)
+def find_or_add(slot_row, row_key, n_rows, key):
+    """Give the row of a key; a new key gets row `n_rows`, and it is the caller who counts on. The table must have room."""
+    mask = slot_row.size - 1
+    slot = first_slot(key, mask)
+    while slot_row[slot] >= 0:
+        if row_key[slot_row[slot]] == key:
+            return slot_row[slot]
+        slot = (slot + 1) & mask
+    slot_row[slot] = n_rows
+    row_key[n_rows] = key
+    return n_rows
+
+
+@njit(cache=True, nogil=True)
+def _fill_slots(slot_row, row_key, n_rows):
+    mask = slot_row.size - 1
+    for row in range(n_rows):
+        slot = first_slot(row_key[row], mask)
+        while slot_row[slot] >= 0:
+            slot = (slot + 1) & mask
+        slot_row[slot] = row
+
+
+class VoxelRows:
+    """Rows by key: open addressing with linear probing, at most half full, and the row columns that grow with it.
+
+    Attributes: `slot_row` (C,) int32, -1 = empty, C a power of two; `row_key` (R,) int64; `n` rows in use; `columns`, each (R, ...).
+    """
+
+    def __init__(self, **columns: tuple[tuple[int, ...], np.dtype, float]) -> None:
+        """Declare columns as name=(shape of a row, dtype, value of a new row)."""
+        self._new = columns
+        self.n = 0
+        self.slot_row = np.full(2048, -1, dtype=np.int32)
+        self.row_key = np.zeros(1024, dtype=np.int64)
+        self.columns = {name: np.full((1024, *shape), fill, dtype=dtype) for name, (shape, dtype, fill) in columns.items()}
+
+    def reserve(self, n_more: int) -> None:
+        """Make room for `n_more` further rows."""
+        need, have = self.n + n_more, len(self.row_key)
+        if need <= have:
+            return
+        if need > 1 << 29:
+            raise SlamError(f"the map would need {need} voxels; choose larger ones")
+        # A factor of 1.5 keeps the peak while copying at 2.5 times the rows in use; 2 would make it 3.
+        size = max(need, have + have // 2)
+        self.row_key = _grown(self.row_key, size, 0)
+        for name, (_, _, fill) in self._new.items():
+            self.columns[name] = _grown(self.columns[name], size, fill)
+        if 2 * size > len(self.slot_row):
+            self.slot_row = np.full(1 << int(2 * size - 1).bit_length(), -1, dtype=np.int32)
+            _fill_slots(self.slot_row, self.row_key, self.n)
+
+
+def _grown(column: np.ndarray, size: int, fill: float) -> np.ndarray:
+    out = np.empty((size, *column.shape[1:]), dtype=column.dtype)
+    out[: len(column)] = column
+    out[len(column) :] = fill
+    return out

@@ -1,0 +1,94 @@
+"""Pictures of the grid for people: with trajectory, path, scale bar and legend."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from slamcli.errors import SlamError
+from slamcli.schema import Grid
+
+COLOURS = {"occupied": "#1a1a1a", "free": "#ffffff", "unknown": "#c8c8c8"}
+TRAJECTORY, ROUTE, START, GOAL = "#0072b2", "#d55e00", "#009e73", "#cc79a7"
+LONGEST_SIDE = 11.0  # inches
+BAR_LENGTHS = np.array([0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0])  # [m]
+
+
+def save_picture(path: Path, grid: Grid, *, trajectory: np.ndarray | None = None, route: np.ndarray | None = None, radius: float = 0.0,
+                 title: str = "") -> None:  # fmt: skip
+    """Draw a grid.
+
+    trajectory : (N, 2 or more) [m, level frame] camera centres; a row of NaN interrupts the line
+    route : (M, 2) [m] planned path, drawn as wide as a robot of `radius` [m]
+    """
+    path = Path(path)
+    if path.suffix.lower() not in (".png", ".pdf", ".svg"):
+        raise SlamError(f"{path}: not a kind of picture that can be drawn; name it *.png, *.pdf or *.svg")
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    extent = _extent(grid)
+    size = np.array([extent[1] - extent[0], extent[3] - extent[2]])
+    inches = np.maximum(LONGEST_SIDE * size / size.max(), 4.0) + [0.8, 1.4]
+    figure = Figure(figsize=tuple(inches))
+    FigureCanvasAgg(figure)
+    draw(figure.add_subplot(), grid, trajectory=trajectory, route=route, radius=radius, title=title)
+    try:
+        figure.savefig(path, dpi=130, bbox_inches="tight")
+    except OSError as error:
+        raise SlamError(f"{path}: cannot be written ({error.strerror or error}); choose another place") from None
+
+
+def draw(axis: Any, grid: Grid, *, trajectory: np.ndarray | None = None, route: np.ndarray | None = None, radius: float = 0.0,
+         title: str = "") -> None:  # fmt: skip
+    """Draw a grid into matplotlib axes, x to the right, y up."""
+    from matplotlib.colors import ListedColormap
+    from matplotlib.patches import Patch
+
+    names = ("unknown", "free", "occupied")
+    extent = _extent(grid)
+    colours = ListedColormap([COLOURS[name] for name in names])
+    axis.imshow(grid.state, origin="lower", extent=extent, cmap=colours, vmin=-1, vmax=1, interpolation="nearest")
+    handles: list[Any] = [Patch(facecolor=COLOURS[name], edgecolor="#888888", label=name) for name in reversed(names)]
+    if trajectory is not None and len(trajectory):
+        handles += axis.plot(trajectory[:, 0], trajectory[:, 1], color=TRAJECTORY, lw=1.0, label="camera")
+    if route is not None and len(route):
+        handles += _draw_route(axis, route, radius)
+    axis.set_xlim(extent[:2])
+    axis.set_ylim(extent[2:])
+    axis.set_aspect("equal")
+    axis.set_xlabel("x [m]")
+    axis.set_ylabel("y [m]")
+    axis.set_title(title, fontsize=10)
+    _scale_bar(axis, extent)
+    axis.legend(handles=handles, loc="upper center", bbox_to_anchor=(0.5, -0.08), ncols=len(handles), fontsize=8, frameon=False)
+
+
+def _extent(grid: Grid) -> tuple[float, float, float, float]:
+    rows, columns = grid.state.shape
+    x, y = grid.origin
+    return float(x), float(x + columns * grid.resolution), float(y), float(y + rows * grid.resolution)
+
+
+def _draw_route(axis: Any, route: np.ndarray, radius: float) -> Sequence[Any]:
+    from matplotlib.patches import Circle
+
+    if radius > 0.0:
+        for xy in route[:: max(1, len(route) // 400)]:
+            axis.add_patch(Circle(xy, radius, facecolor=ROUTE, edgecolor="none", alpha=0.04))
+    line = axis.plot(route[:, 0], route[:, 1], color=ROUTE, lw=1.6, label="path")
+    ends = [
+        *axis.plot(*route[0], marker="o", ms=7, color=START, ls="none", label="start"),
+        *axis.plot(*route[-1], marker="X", ms=8, color=GOAL, ls="none", label="goal"),
+    ]
+    return [*line, *ends]
+
+
+def _scale_bar(axis: Any, extent: tuple[float, float, float, float]) -> None:
+    """Draw a bar of a round length, some fifth of the width, above the grid's left end, where it hides no cell."""
+    width = extent[1] - extent[0]
+    length = BAR_LENGTHS[np.argmin(np.abs(np.log(BAR_LENGTHS / (0.2 * width))))]
+    above = axis.get_xaxis_transform()  # x in metres, y as a share of the axes' height
+    axis.plot([extent[0], extent[0] + length], [1.02, 1.02], color="#000000", lw=3.0, solid_capstyle="butt", transform=above, clip_on=False)
+    axis.text(extent[0] + length, 1.02, f"  {length:g} m", fontsize=8, va="center", transform=above)

@@ -1,0 +1,80 @@
+"""The second look: every frame is matched again against the final map. Only a batch program can do this."""
+
+import numpy as np
+
+from slamcli.config import SensorConfig, TrackConfig
+from slamcli.geometry import se3
+from slamcli.geometry.camera import Camera
+from slamcli.mapping import projection
+from slamcli.mapping.mapbuilder import MapBuilder
+from slamcli.mapping.tracker import estimate_pose, frame_features
+from slamcli.schema import KEY_FRAME, LOST, RELOCALISED, Tracks, frame_poses
+
+NEIGHBOURS = 20  # covisible key frames whose landmarks are looked for
+LOST_WIDENING = 8.0  # a lost frame's neighbour stands where a frame's fast turn leaves it, some tens of pixels off
+
+
+def refine_frames(builder: MapBuilder, tracks: Tracks, camera: Camera, sensor: SensorConfig, settings: TrackConfig, progress) -> Tracks:
+    """Refine every frame that is no key frame against the landmarks around it; lost ones are tried from both sides.
+
+    A frame keeps its pose where much fewer landmarks agree than before. Returns new Tracks.
+    """
+    look = _Look(builder, tracks, camera, sensor, settings)
+    n = len(tracks.state)
+    for i in progress(range(n), "hindsight"):
+        if tracks.state[i] not in (LOST, KEY_FRAME):
+            look.at(i, look.T_wc[i], int(tracks.ref_kf[i]))
+    for order, step in ((range(n), -1), (range(n - 1, -1, -1), 1)):
+        for i in order:  # a lost frame begins where its neighbour in time stands
+            j = i + step
+            is_open = look.state[i] == LOST and 0 <= j < n and look.ref_kf[j] >= 0
+            if is_open and look.at(i, look.T_wc[j], int(look.ref_kf[j]), widening=LOST_WIDENING):
+                look.at(i, look.T_wc[i], int(look.ref_kf[i]))
+                look.state[i] = RELOCALISED
+    return Tracks(ref_kf=look.ref_kf, T_kc=look.T_kc, state=look.state, n_inliers=look.n_inliers)
+
+
+class _Look:
+    """The second look at frames, and what it found."""
+
+    def __init__(self, builder: MapBuilder, tracks: Tracks, camera: Camera, sensor: SensorConfig, settings: TrackConfig) -> None:
+        self.builder, self.camera, self.sensor, self.settings = builder, camera, sensor, settings
+        self.T_wc = frame_poses(tracks, builder.snapshot())
+        self.ref_kf, self.T_kc = tracks.ref_kf.copy(), tracks.T_kc.copy()
+        self.state, self.n_inliers = tracks.state.copy(), tracks.n_inliers.copy()
+        self._around: dict[int, tuple] = {}
+
+    def at(self, i: int, T_wc: np.ndarray, kf: int, *, widening: float = 1.0) -> bool:
+        """Look for frame `i` at `T_wc` among the landmarks around key frame `kf`; False, and nothing changes, if it is not there.
+
+        widening : of the search window, where `T_wc` is a guess
+        """
+        wanted = max(self.settings.min_inliers, int(self.n_inliers[i]) // 2)
+        frame, candidates = frame_features(self.builder.features, i, self.camera, self.sensor), self._landmarks_around(kf)
+        feature, _ = projection.search(
+            se3.inverse(T_wc),
+            candidates,
+            frame,
+            self.camera,
+            octave_scale=self.builder.octave_scale,
+            radius_px=widening * self.settings.search_radius_px,
+            max_distance=self.settings.search_max_distance,
+            ratio=self.settings.search_ratio,
+        )
+        which = np.flatnonzero(feature >= 0)
+        if len(which) < wanted:
+            return False
+        estimate = estimate_pose(se3.inverse(T_wc), candidates.xyz[which], frame, feature[which], self.camera)
+        if estimate.n_inliers < wanted:
+            return False
+        self.ref_kf[i], self.n_inliers[i] = kf, estimate.n_inliers
+        self.T_wc[i] = se3.inverse(estimate.T_cw)
+        self.T_kc[i] = se3.inverse(estimate.T_cw @ self.builder.kf.T_wk[kf])
+        return True
+
+    def _landmarks_around(self, kf: int) -> projection.Candidates:
+        if kf not in self._around:
+            neighbours, _ = self.builder.covisible(kf)
+            ids = self.builder.landmarks_in(np.append(neighbours[:NEIGHBOURS], kf))
+            self._around = {kf: self.builder.candidates(ids)}  # frames come in order: the last one is enough
+        return self._around[kf]

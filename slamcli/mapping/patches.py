@@ -1,0 +1,132 @@
+"""Surface patches: key frames' depth reduced to few points with normals, from which the floor is found."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from slamcli.geometry import se3
+from slamcli.geometry.camera import Camera
+
+MAX_FRAMES = 256  # key frames kept; of more, every second one goes: bounds memory, and a floor needs no more
+
+
+@dataclass(frozen=True)
+class Patches:
+    """Small surface pieces of all key frames: blocks of pixels averaged to one point, with a normal."""
+
+    xyz: np.ndarray  # (N, 3) m, world
+    normal: np.ndarray  # (N, 3) unit, world, towards the camera; NaN where the neighbours give none
+    sigma: np.ndarray  # (N,) m, of the point along its ray
+    frame: np.ndarray  # (N,) int32, row in T_wk
+    grid: np.ndarray  # (N, 2) int32, row and column of the block
+    shape: tuple[int, int]  # rows and columns of blocks in an image
+
+
+@dataclass(frozen=True)
+class Support:
+    """A plane and what speaks for it."""
+
+    plane: np.ndarray  # (4,) unit normal and offset, world
+    inliers: np.ndarray  # (M,) rows of Patches
+    n_candidates: int  # patches the inliers were chosen from
+
+
+def collect(frames: Iterable[tuple[np.ndarray, np.ndarray]], camera: Camera, *, side: int, max_range: float) -> tuple[Patches, np.ndarray]:
+    """Reduce each key frame to surface patches in the world frame; returns Patches and the T_wk (F, 4, 4) kept."""
+    rays = np.ascontiguousarray(camera.rays)
+    shape = (camera.height // side, camera.width // side)
+    kept: list[tuple] = []
+    step = 1
+    for i, (depth, T_wk) in enumerate(frames):
+        if i % step or not np.isfinite(T_wk).all():
+            continue
+        kept.append((_patches(depth, rays, T_wk, side, max_range), T_wk))
+        if len(kept) >= MAX_FRAMES:
+            kept, step = kept[::2], 2 * step
+    if not kept:
+        empty = np.zeros((0, 3))
+        return Patches(empty, empty, np.zeros(0), np.zeros(0, np.int32), np.zeros((0, 2), np.int32), shape), np.zeros((0, 4, 4))
+    columns = [np.concatenate([row[0][j] for row in kept]) for j in range(4)]
+    frame = np.repeat(np.arange(len(kept), dtype=np.int32), [len(row[0][0]) for row in kept])
+    return Patches(columns[0], columns[1], columns[2], frame, columns[3], shape), np.stack([row[1] for row in kept])
+
+
+def _patches(depth: np.ndarray, rays: np.ndarray, T_wk: np.ndarray, side: int, max_range: float) -> tuple:
+    blocks = _block_points(np.ascontiguousarray(depth, dtype=np.float32), rays, side, np.float32(max_range))
+    normal_k = _normals(blocks)
+    rows, columns = np.nonzero(np.isfinite(blocks[..., 2]))
+    at = blocks[rows, columns].astype(np.float64)
+    normal_w = normal_k[rows, columns] @ T_wk[:3, :3].T
+    return se3.transform(T_wk, at[:, :3]), normal_w, at[:, 3], np.stack([rows, columns], axis=1).astype(np.int32)
+
+
+@njit(cache=True, nogil=True)
+def _block_points(depth, rays, side, max_range):
+    """Average up to 4 x 4 pixels of each `side` x `side` block to a point x y z and its depth's noise; NaN where it is no one surface.
+
+    Inverse depth is averaged: on a plane it is linear in the pixel, so that the mean lies on the plane at the pixels' mean ray.
+    """
+    rows, columns = depth.shape[0] // side, depth.shape[1] // side
+    step = (side + 3) // 4
+    out = np.full((rows, columns, 4), np.nan, dtype=np.float32)
+    for r in range(rows):
+        for c in range(columns):
+            n, tried, total, total_x, total_y = 0, 0, 0.0, 0.0, 0.0
+            low, high = np.inf, 0.0
+            for i in range(r * side, (r + 1) * side, step):
+                for j in range(c * side, (c + 1) * side, step):
+                    tried += 1
+                    z = depth[i, j]
+                    if z > 0.0 and z <= max_range:
+                        n += 1
+                        total += 1.0 / z
+                        total_x += rays[i, j, 0]
+                        total_y += rays[i, j, 1]
+                        low, high = min(low, z), max(high, z)
+            # A block on a floor seen at a flat angle spans much depth, so the bound on the spread is wide; it only rejects edges.
+            if 2 * n >= tried and high - low <= 0.02 + 0.1 * low:
+                z = n / total
+                out[r, c, 0], out[r, c, 1], out[r, c, 2] = z * total_x / n, z * total_y / n, z
+                out[r, c, 3] = 0.0012 + 0.0019 * (z - 0.4) * (z - 0.4)
+    return out
+
+
+@njit(cache=True, nogil=True)
+def _normals(points):
+    """Give unit normals (R, C, 3) towards the camera by central differences over the blocks' points; NaN at edges and jumps of depth."""
+    rows, columns = points.shape[0], points.shape[1]
+    out = np.full((rows, columns, 3), np.nan)
+    for r in range(1, rows - 1):
+        for c in range(1, columns - 1):
+            ax = points[r, c + 1, 0] - points[r, c - 1, 0]
+            ay = points[r, c + 1, 1] - points[r, c - 1, 1]
+            az = points[r, c + 1, 2] - points[r, c - 1, 2]
+            bx = points[r + 1, c, 0] - points[r - 1, c, 0]
+            by = points[r + 1, c, 1] - points[r - 1, c, 1]
+            bz = points[r + 1, c, 2] - points[r - 1, c, 2]
+            reach = 0.15 * points[r, c, 2]
+            nx, ny, nz = by * az - bz * ay, bz * ax - bx * az, bx * ay - by * ax
+            length = np.sqrt(nx * nx + ny * ny + nz * nz)
+            if not (abs(az) < reach and abs(bz) < reach and length > 0.0):
+                continue
+            if nx * points[r, c, 0] + ny * points[r, c, 1] + nz * points[r, c, 2] > 0.0:
+                length = -length
+            out[r, c, 0], out[r, c, 1], out[r, c, 2] = nx / length, ny / length, nz / length
+    return out
+
+
+def fit_plane(xyz: np.ndarray, weight: np.ndarray, start: np.ndarray, *, rounds: int = 5) -> np.ndarray:
+    """Minimise the weighted sum of distances of points (N, 3) to a plane (4,), [L] (18), by re-weighted least squares."""
+    plane = start
+    for _ in range(rounds):
+        residual = np.abs(xyz @ plane[:3] + plane[3])
+        w = weight / np.maximum(residual, 1e-3)  # sum w r^2 is then the sum of distances, smoothed below 1 mm
+        w = w / w.sum()
+        mean = w @ xyz
+        centred = xyz - mean
+        normal = np.linalg.eigh((centred * w[:, None]).T @ centred)[1][:, 0]
+        normal = normal if normal @ start[:3] > 0.0 else -normal
+        plane = np.append(normal, -normal @ mean)
+    return plane

@@ -1,0 +1,88 @@
+"""What a stage costs: wall and CPU time, peak memory, and the time numba spent compiling."""
+
+import os
+import resource
+import sys
+import threading
+import time
+from types import TracebackType
+from typing import Any
+
+SAMPLING = 0.02  # [s] between looks at the resident memory
+
+
+class Meter:
+    """Measure the block it is wrapped around.
+
+    Memory is sampled, since the kernel's own high-water mark belongs to the whole process and an earlier stage may have set it.
+    """
+
+    seconds = cpu_seconds = compile_seconds = 0.0
+    peak_rss_mb = 0.0
+    _watch: Any = None
+
+    def __enter__(self) -> "Meter":
+        self._done = threading.Event()
+        self._sampler = threading.Thread(target=self._sample, name="slamcli-memory", daemon=True)
+        self._start, self._cpu_start = time.perf_counter(), time.process_time()
+        self._sampler.start()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self.seconds = time.perf_counter() - self._start
+        self.cpu_seconds = time.process_time() - self._cpu_start
+        self._done.set()
+        self._sampler.join()
+        if self._watch is not None:
+            from numba.core import event
+
+            event.unregister("numba:compile", self._watch)
+            self.compile_seconds = self._watch.total
+
+    def watch_compiler(self) -> None:
+        """Count compilation from here on, if numba has been imported by now."""
+        if "numba" in sys.modules:
+            from numba.core import event
+
+            self._watch = _compiler_watch()
+            event.register("numba:compile", self._watch)
+
+    def _sample(self) -> None:
+        while True:
+            self.peak_rss_mb = max(self.peak_rss_mb, _resident_mb())
+            if self._done.wait(SAMPLING):
+                self.peak_rss_mb = max(self.peak_rss_mb, _resident_mb())
+                return
+
+
+def _resident_mb() -> float:
+    try:
+        with open("/proc/self/statm", "rb") as file:
+            return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20
+    except OSError:  # no /proc: the process's own high-water mark, in kB but on macOS in bytes
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        return peak / 2**20 if sys.platform == "darwin" else peak / 2**10
+
+
+def _compiler_watch() -> Any:
+    """Build the listener that adds up the time of real compilations; loading from numba's cache is none."""
+    from numba.core import event
+
+    from slamcli.console import say
+
+    class Watch(event.Listener):
+        depth, start, total = 0, 0.0, 0.0  # a kernel compiles the helpers it calls within its own compilation
+
+        def on_start(self, _: event.Event) -> None:
+            if self.depth == 0:
+                self.start = time.perf_counter()
+                if self.total == 0.0:
+                    say("compiling kernels; this happens once")
+            self.depth += 1
+
+        def on_end(self, _: event.Event) -> None:
+            self.depth -= 1
+            if self.depth == 0:
+                self.total += time.perf_counter() - self.start
+
+    return Watch()

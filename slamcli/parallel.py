@@ -1,0 +1,57 @@
+"""Ordered work on a few threads. OpenCV and the kernels release the GIL, so threads are enough: nothing is pickled or copied."""
+
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+from typing import TypeVar
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+
+def ordered_map(function: Callable[[Item], Result], items: Iterable[Item], *, workers: int, ahead: int = 4) -> Iterator[Result]:
+    """Yield ``function(item)`` for each item, in the order of `items`, computed on `workers` threads.
+
+    At most ``workers + ahead`` results are finished or under way beyond the one the caller holds, so memory stays bounded however
+    slow the caller is. An error in `function` is raised where its result would have come; leaving the loop early cancels the rest.
+    """
+    with _one_thread_in_opencv(), ThreadPoolExecutor(max_workers=workers, thread_name_prefix="slamcli") as pool:
+        pending: deque[Future[Result]] = deque()
+        try:
+            for item in items:
+                pending.append(pool.submit(function, item))
+                if len(pending) >= workers + ahead:
+                    yield pending.popleft().result()
+            while pending:
+                yield pending.popleft().result()
+        finally:
+            for future in pending:
+                future.cancel()
+
+
+@contextmanager
+def one_thread_in_blas() -> Iterator[None]:
+    """Keep the BLAS of numpy and of scipy to one thread: with more, sums run in another order and the last digits differ.
+
+    Our systems are small and sparse, so nothing is lost; waiting threads would only burn CPU time.
+    """
+    import numpy as np  # noqa: F401
+    import scipy.linalg  # noqa: F401  # both libraries must be loaded to be told
+    from threadpoolctl import threadpool_limits
+
+    with threadpool_limits(limits=1, user_api="blas"):
+        yield
+
+
+@contextmanager
+def _one_thread_in_opencv() -> Iterator[None]:
+    """Keep OpenCV from starting its own threads within each of ours: the two would multiply."""
+    import cv2
+
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(before)

@@ -1,0 +1,126 @@
+"""What a reader of the page should know before trusting the result, in plain words."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from slamcli.freshness import MISSING
+from slamcli.report.collect import Content
+from slamcli.schema import LOST
+
+GOOD, NOTE, BAD = "good", "note", "bad"
+FEW_FEATURES = 150  # in a frame
+FEW_INLIERS = 30  # landmarks that a frame's pose rests on
+MANY = 0.05  # share of the frames
+SCALE_OFF = 0.02
+MOST_STAGE_WARNINGS = 5  # shown of each stage
+MOST_SPANS = 5  # of lost frames
+
+
+@dataclass(frozen=True)
+class Remark:
+    """One remark: is it good, worth knowing, or bad."""
+
+    kind: str
+    text: str
+
+
+def remarks(content: Content) -> list[Remark]:
+    """Judge a run; the gravest first."""
+    found = [
+        *_poses(content),
+        *_features(content),
+        *_loops(content),
+        *_scale(content),
+        *_floor(content),
+        *_stages(content),
+        *(Remark(NOTE, f"Recording: {text}") for text in content.doubts),
+    ]
+    return sorted(found, key=lambda remark: (BAD, NOTE, GOOD).index(remark.kind))
+
+
+def _poses(content: Content) -> list[Remark]:
+    n, lost = len(content.stamp), int((content.state == LOST).sum())
+    if not lost:
+        return [Remark(GOOD, f"All {n} frames have a pose.")]
+    spans = content.summary("track").get("lost_spans") or []
+    where = "; ".join(
+        f"{first} to {last}: {reason}" if last > first else f"{first}: {reason}" for first, last, reason in spans[:MOST_SPANS]
+    )
+    more = f"; and {len(spans) - MOST_SPANS} more stretches" if len(spans) > MOST_SPANS else ""
+    return [
+        Remark(
+            BAD if lost > MANY * n else NOTE,
+            f"{lost} of {n} frames are lost and have no pose. {where and 'Frames ' + where + more + '.'}".strip(),
+        )
+    ]
+
+
+def _features(content: Content) -> list[Remark]:
+    found = []
+    n = len(content.stamp)
+    few = int((content.n_features < FEW_FEATURES).sum())
+    if few > MANY * n:
+        found.append(Remark(BAD, f"{few} of {n} frames have fewer than {FEW_FEATURES} features: too dark, blurred, or bare walls."))
+    weak = int(((content.n_inliers < FEW_INLIERS) & (content.state != LOST)).sum())
+    if weak > MANY * n:
+        found.append(Remark(NOTE, f"The poses of {weak} frames rest on fewer than {FEW_INLIERS} landmarks and may be inaccurate."))
+    without = content.summary("extract").get("frames_without_depth", 0)
+    if without > MANY * n:
+        found.append(Remark(NOTE, f"{without} of {n} colour frames have no depth image near enough in time."))
+    return found
+
+
+def _loops(content: Content) -> list[Remark]:
+    if content.stage != "loop":
+        return [Remark(NOTE, f"Loop closing has not been run: this is the trajectory of {content.stage}.")]
+    if len(content.loops):
+        return [Remark(GOOD, "One loop was closed." if len(content.loops) == 1 else f"{len(content.loops)} loops were closed.")]
+    return [Remark(NOTE, "No loop was closed. If the camera came back to a place it had seen, the map may show it twice.")]
+
+
+def _scale(content: Content) -> list[Remark]:
+    ape = content.ape.get(content.stage)
+    if ape is None or abs(ape.scale - 1.0) <= SCALE_OFF:
+        return []
+    scale = content.recording["camera"]["depth_scale"]
+    fits = f"The trajectory fits the truth best when scaled by {100 * (ape.scale - 1.0):+.1f} %"
+    return [Remark(BAD, f"{fits}: is the depth scale right? It is {scale:g}, {scale / ape.scale:.0f} would fit.")]
+
+
+def _floor(content: Content) -> list[Remark]:
+    if content.ground is None:
+        return []
+    if not content.ground.is_found:
+        return [Remark(BAD, "No floor was found. Heights are measured from the first camera, so the grid is not fit to drive on.")]
+    rms = 1000 * float(content.ground.inlier_rms)
+    return [Remark(GOOD, f"The floor was found; its points lie within {rms:.0f} mm (RMS) of a plane.")]
+
+
+def _stages(content: Content) -> list[Remark]:
+    found = []
+    for stage, state in content.states.items():
+        if state.state == MISSING:
+            found.append(Remark(NOTE, f"{stage} has not been run; go on with: slamcli run"))
+        elif not state.is_fresh:
+            found.append(Remark(BAD, f"{stage} is {state.state} ({state.reason}); bring it up to date with: slamcli run"))
+        warnings = [
+            text
+            for text in state.record.get("warnings", [])
+            if "are lost:" not in text and "is lost:" not in text and "no floor" not in text
+        ]
+        found += [Remark(NOTE, f"{stage}: {text}") for text in warnings[:MOST_STAGE_WARNINGS]]
+        if len(warnings) > MOST_STAGE_WARNINGS:
+            total = state.record.get("n_warnings", len(warnings))
+            found.append(Remark(NOTE, f"{stage}: {total} warnings in all; they are in log.txt"))
+    return found
+
+
+def headline(content: Content) -> str:
+    """Sum up in one line."""
+    n, n_poses = len(content.stamp), int(content.has_pose.sum())
+    path = content.T_lc[content.has_pose, :3, 3]
+    length = float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
+    text = f"{n_poses} of {n} frames located along {length:.1f} m in {content.stamp[-1] - content.stamp[0]:.1f} s"
+    ape = content.ape.get(content.stage)
+    return f"{text}; {1000 * float(np.sqrt(np.mean(ape.error**2))):.1f} mm from the truth (RMS)" if ape else text

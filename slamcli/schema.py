@@ -1,0 +1,147 @@
+"""The core types. Each is a frozen record of arrays and, saved as a folder of `.npy`, also an artefact's schema.
+
+F frames, M features, P pairs, Q matches, W words, B word-vector entries, K key frames, L landmarks, O observations, C closures.
+Missing values: depth and pose NaN, index -1. `offset` columns delimit ragged rows: those of frame i are offset[i]:offset[i+1].
+"""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+FORMAT = 1  # of everything a run directory holds; raised whenever an array changes its meaning
+
+
+def array(dtype: str, shape: str, meaning: str) -> Any:
+    """Declare a field: numpy dtype, symbolic shape such as "M 2" or "F+1" ("" for a scalar), meaning with unit."""
+    return field(metadata={"dtype": np.dtype(dtype), "shape": tuple(shape.split()), "meaning": meaning})
+
+
+@dataclass(frozen=True)
+class Features:
+    """Key points of every frame, by extract."""
+
+    stamp: np.ndarray = array("f8", "F", "s, of the colour image")
+    depth_stamp: np.ndarray = array("f8", "F", "s, of the depth image paired with it, NaN where there is none")
+    offset: np.ndarray = array("i8", "F+1", "feature rows of a frame")
+    xy: np.ndarray = array("f4", "M 2", "px, undistorted, column then row")
+    depth: np.ndarray = array("f4", "M", "m along the optical axis, NaN where there is none; read at the raw pixel")
+    octave: np.ndarray = array("u1", "M", "pyramid level")
+    angle: np.ndarray = array("f4", "M", "rad, of the intensity centroid")
+    desc: np.ndarray = array("u1", "M 32", "ORB descriptor, 256 bits")
+    octave_scale: np.ndarray = array("f8", "", "size ratio of neighbouring pyramid levels")
+
+
+@dataclass(frozen=True)
+class Words:
+    """The visual words of every feature and the word vector of every frame, by match."""
+
+    idf: np.ndarray = array("f4", "W", "inverse document frequency of each word of the vocabulary")
+    word: np.ndarray = array("i4", "M", "word of each feature row")
+    node: np.ndarray = array(
+        "i4", "M 2", "vocabulary nodes near the root: features under one node are compared; the second may be -1, none"
+    )
+    bow_offset: np.ndarray = array("i8", "F+1", "word-vector rows of a frame")
+    bow_word: np.ndarray = array("i4", "B", "increasing within a frame")
+    bow_weight: np.ndarray = array("f4", "B", "tf-idf, sums to 1 within a frame (L1)")
+
+
+@dataclass(frozen=True)
+class Matches:
+    """Feature matches between neighbouring frames, by match."""
+
+    pair: np.ndarray = array("i4", "P 2", "frames (i, j), j < i, sorted")
+    offset: np.ndarray = array("i8", "P+1", "match rows of a pair")
+    row: np.ndarray = array("i4", "Q 2", "feature index within frame i and within frame j")
+    distance: np.ndarray = array("u1", "Q", "Hamming distance, bits")
+
+
+LOST, TRACKED, KEY_FRAME, RELOCALISED = 0, 1, 2, 3  # values of Tracks.state
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """Each frame's pose relative to a key frame, by track and, refined with hindsight, by loop; map updates move the frames along."""
+
+    ref_kf: np.ndarray = array("i4", "F", "row in Map of the key frame a frame hangs on, -1 = lost")
+    T_kc: np.ndarray = array("f8", "F 4 4", "frame's camera to that key frame's camera, NaN = lost")
+    state: np.ndarray = array("u1", "F", "0 lost, 1 tracked, 2 key frame, 3 relocalised")
+    n_inliers: np.ndarray = array("i4", "F", "landmarks the pose rests on")
+
+
+@dataclass(frozen=True)
+class Map:
+    """Key frames, landmarks and the observations that join them."""
+
+    kf_frame: np.ndarray = array("i4", "K", "frame index, increasing")
+    T_wk: np.ndarray = array("f8", "K 4 4", "key frame's camera to world")
+    lm_xyz: np.ndarray = array("f8", "L 3", "m, world")
+    obs_lm: np.ndarray = array("i4", "O", "sorted by (landmark, key frame), pairs unique")
+    obs_kf: np.ndarray = array("i4", "O", "row in kf_frame")
+    obs_row: np.ndarray = array("i8", "O", "row in Features")
+
+
+@dataclass(frozen=True)
+class Timing:
+    """When the camera measures, found by optimize from the recording itself."""
+
+    readout: np.ndarray = array(
+        "f8", "", "s, between the first and the last row of a colour image; 0 = global shutter; the stamp is the middle row's"
+    )
+    depth_delay: np.ndarray = array("f8", "", "s, by which depth images were taken later than their stamps say")
+    twist: np.ndarray = array("f8", "F 6", "m/s, rad/s, motion of each frame's camera in its own frame")
+
+
+@dataclass(frozen=True)
+class Closures:
+    """Accepted loop closures, by loop."""
+
+    closure_kf: np.ndarray = array("i4", "C 2", "key frames (i, j), j < i")
+    closure_T_ij: np.ndarray = array("f8", "C 4 4", "x_i = T_ij @ x_j")
+    closure_inliers: np.ndarray = array("i4", "C", "features that agree with T_ij")
+    closure_score: np.ndarray = array("f4", "C", "similarity of the word vectors, [Z] (10)")
+
+
+@dataclass(frozen=True)
+class Ground:
+    """The floor and the level frame `l` (z up, floor at z = 0), by densify."""
+
+    T_lw: np.ndarray = array("f8", "4 4", "world to level; identity up to a turn to z up where no floor was found")
+    plane: np.ndarray = array("f8", "4", "a b c d of a x + b y + c z + d = 0 in the world frame, unit normal pointing up; [L] (17)")
+    inlier_rms: np.ndarray = array("f8", "", "m, distance of the inliers to the plane")
+    inlier_share: np.ndarray = array("f8", "", "inliers among the candidate ground points")
+    is_found: np.ndarray = array("?", "", "whether a floor was found")
+
+
+@dataclass(frozen=True)
+class Grid:
+    """The 2-D grid before the decision rule, by grid2d. Row 0 is the smallest y, column 0 the smallest x."""
+
+    p_occupied: np.ndarray = array("f4", "H W", "P(F), NaN where never seen")
+    n_seen: np.ndarray = array("i4", "H W", "key frames that saw the cell")
+    state: np.ndarray = array("i1", "H W", "1 occupied, 0 free, -1 unknown; [L] (24)")
+    origin: np.ndarray = array("f8", "2", "m, level frame: x, y of the outer corner of cell (0, 0)")
+    resolution: np.ndarray = array("f8", "", "m, side of a cell")
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Poses over time."""
+
+    stamp: np.ndarray = array("f8", "N", "s, increasing")
+    T_wc: np.ndarray = array("f8", "N 4 4", "camera to world")
+
+
+def frame_poses(tracks: Tracks, map_: Map) -> np.ndarray:
+    """Give T_wc (F, 4, 4) of every frame under the map's key-frame poses, NaN where lost."""
+    T_wc = np.full((len(tracks.ref_kf), 4, 4), np.nan)
+    has_pose = tracks.ref_kf >= 0
+    T_wc[has_pose] = map_.T_wk[tracks.ref_kf[has_pose]] @ tracks.T_kc[has_pose]
+    return T_wc
+
+
+def trajectory(stamp: np.ndarray, tracks: Tracks, map_: Map) -> Trajectory:
+    """Give the poses of the frames that have one."""
+    T_wc = frame_poses(tracks, map_)
+    has_pose = np.isfinite(T_wc[:, 0, 0])
+    return Trajectory(stamp=stamp[has_pose], T_wc=T_wc[has_pose])

@@ -1,0 +1,124 @@
+"""extract: images -> ORB features with depth."""
+
+import json
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from slamcli import artifacts
+from slamcli.config import ExtractConfig
+from slamcli.datasets import Dataset
+from slamcli.errors import BadFrame, SlamError
+from slamcli.geometry.camera import Camera
+from slamcli.parallel import ordered_map
+from slamcli.schema import Features
+from slamcli.vision import orb
+
+
+@dataclass(frozen=True)
+class _Frame:
+    """What one frame gives."""
+
+    points: orb.KeyPoints
+    depth: np.ndarray  # (N,) float32 [m]
+    has_depth: bool
+    faults: list[str]  # why an image could not be used
+
+
+def run(inputs, out: Path, cfg, tools) -> dict:
+    """Detect ORB features in every colour frame and read their depth."""
+    dataset, camera = inputs.dataset, inputs.dataset.camera
+    frames = ordered_map(partial(_extract, dataset, cfg.extract), range(len(dataset)), workers=tools.workers)
+    found = list(tools.progress(frames, "extract", len(dataset)))
+    for i, frame in enumerate(found):
+        for fault in frame.faults:
+            tools.warn(f"frame {i} skipped: {fault}" if len(frame.points) == 0 else f"frame {i} has no depth: {fault}")
+    if not any(len(frame.points) for frame in found):
+        raise SlamError(
+            f"{dataset.root}: no feature in any of the {len(dataset)} colour frames: are they blank? try: slamcli inspect {dataset.root}"
+        )
+    features = _table(dataset, camera, found, cfg.extract.scale)
+    artifacts.save(features, out)
+    _write_association(out / "frames.txt", dataset, features.depth_stamp)
+    (out / "camera.json").write_text(json.dumps(camera.to_dict(), indent=2) + "\n")
+    n = np.diff(features.offset)
+    return {
+        "frames": len(dataset),
+        "features": int(n.sum()),
+        "features_per_frame": [int(n.min()), float(np.median(n)), int(n.max())],
+        "with_depth": float(np.isfinite(features.depth).mean()),
+        "frames_without_depth": int(np.isnan(features.depth_stamp).sum()),
+        "bad_images": sum(len(frame.faults) for frame in found),
+    }
+
+
+def _extract(dataset: Dataset, settings: ExtractConfig, i: int) -> _Frame:
+    """Detect the features of frame i; an image that cannot be used gives none, or none with depth."""
+    faults = []
+    try:
+        grey = dataset.grey(i)
+    except BadFrame as error:
+        return _Frame(orb.no_key_points(), np.zeros(0, np.float32), has_depth=False, faults=[str(error)])
+    points = orb.detect(
+        grey,
+        features=settings.features,
+        levels=settings.levels,
+        scale=settings.scale,
+        cell=settings.cell,
+        threshold=settings.fast_threshold,
+        threshold_low=settings.fast_threshold_low,
+        smooth=settings.smooth,
+        pool=settings.pool,
+        rank_by=settings.rank_by,
+        subpixel=settings.subpixel,
+    )
+    try:
+        depth = dataset.depth(i)
+    except BadFrame as error:
+        depth = None
+        faults.append(str(error))
+    if depth is None:
+        return _Frame(points, np.full(len(points), np.nan, np.float32), has_depth=False, faults=faults)
+    return _Frame(points, depth_at(depth, points.xy, window=settings.depth_window), has_depth=True, faults=faults)
+
+
+def depth_at(depth: np.ndarray, xy: np.ndarray, *, window: int = 1) -> np.ndarray:
+    """Read depth (H, W) [m] around raw points xy (N, 2) inside the image, (N,) float32.
+
+    window [px], odd : 1 reads the nearest pixel; more gives the median of the readings in a square, the nearer of two, NaN where there is none
+    """
+    column, row = np.rint(xy).astype(np.int64).T
+    if window == 1:
+        return depth[row, column]
+    reach = np.arange(window) - window // 2
+    rows = np.clip(row[:, None] + reach, 0, depth.shape[0] - 1)
+    columns = np.clip(column[:, None] + reach, 0, depth.shape[1] - 1)
+    readings = np.sort(depth[rows[:, :, None], columns[:, None, :]].reshape(len(xy), window * window), axis=1)  # NaN last
+    n = np.isfinite(readings).sum(axis=1)
+    return readings[np.arange(len(xy)), np.maximum(n - 1, 0) // 2]
+
+
+def _table(dataset: Dataset, camera: Camera, found: list[_Frame], scale: float) -> Features:
+    points = [frame.points for frame in found]
+    raw = np.concatenate([p.xy for p in points])
+    return Features(
+        stamp=np.asarray(dataset.stamp, dtype=np.float64),
+        depth_stamp=np.where([frame.has_depth for frame in found], dataset.depth_stamp, np.nan),
+        offset=np.cumsum([0] + [len(p) for p in points], dtype=np.int64),
+        xy=camera.undistort(raw).astype(np.float32),
+        depth=np.concatenate([frame.depth for frame in found]),
+        octave=np.concatenate([p.octave for p in points]),
+        angle=np.concatenate([p.angle for p in points]),
+        desc=np.concatenate([p.desc for p in points]),
+        octave_scale=np.float64(scale),
+    )
+
+
+def _write_association(path: Path, dataset: Dataset, depth_stamp: np.ndarray) -> None:
+    """Write which depth image goes with which colour image, in the format of the TUM tools: stamp, path, stamp, path."""
+    lines = ["# colour stamp [s], colour image, depth stamp [s], depth image; commented out: no usable depth image"]
+    for stamp, colour, with_depth, depth in zip(dataset.stamp, dataset.colour_path, depth_stamp, dataset.depth_path, strict=True):
+        lines.append(f"{stamp:.6f} {colour} {with_depth:.6f} {depth}" if np.isfinite(with_depth) else f"# {stamp:.6f} {colour}")
+    path.write_text("\n".join(lines) + "\n")

@@ -1,0 +1,99 @@
+"""loop: places seen again are joined, the whole map is adjusted, and every frame is refined against it."""
+
+import csv
+import itertools
+from pathlib import Path
+
+import numpy as np
+
+from slamcli import artifacts
+from slamcli.mapping import adjustment, closure, hindsight, posegraph, timing
+from slamcli.mapping.closure import Candidate
+from slamcli.mapping.mapbuilder import MapBuilder
+from slamcli.schema import LOST, Closures, Features, Map, Timing, Tracks, Words
+from slamcli.stages.track import save_map_stage
+
+
+def run(inputs, out: Path, cfg, tools) -> dict:
+    """Close loops until no new one appears; then look at every frame again."""
+    words, tracks, camera = inputs.load(Words, "match"), inputs.load(Tracks, "optimize"), inputs.camera()
+    when = inputs.load(Timing, "optimize")
+    features = timing.rectify(inputs.load(Features, "extract"), when, camera)
+    builder = MapBuilder.from_map(features, inputs.load(Map, "optimize"))
+    tried: list[Candidate] = []
+    if cfg.loop.enabled and len(builder.kf) > 2:
+        tried = close_loops(builder, words, camera, cfg, tools)
+    accepted = [c for c in tried if c.is_accepted]
+    if accepted and cfg.loop.hindsight:
+        tracks = hindsight.refine_frames(builder, tracks, camera, cfg.sensor, cfg.track, tools.progress)
+    write_pose_graph(out / "posegraph.g2o", builder, accepted, cfg.loop)
+    write_candidates(out / "candidates.csv", tried)
+    map_ = builder.snapshot()
+    save_map_stage(out, features.stamp, tracks, map_)
+    artifacts.save(tracks, out)
+    artifacts.save(when, out)
+    artifacts.save(closures_of(accepted), out)
+    return {
+        "frames": len(features.stamp),
+        "candidates": len(tried),
+        "closures": len(accepted),
+        "lost": int((tracks.state == LOST).sum()),
+        "landmarks": len(map_.lm_xyz),
+    }
+
+
+def close_loops(builder: MapBuilder, words: Words, camera, cfg, tools) -> list[Candidate]:
+    """Search, verify, correct, fuse, adjust; again while that brings new closures. Returns all candidates with their fate."""
+    recogniser = closure.Recogniser(words, builder.kf.frame)
+    kfs = np.arange(len(builder.kf), dtype=np.int32)
+    rng = tools.rng()
+    fate: dict[tuple[int, int], Candidate] = {}
+    for _ in range(cfg.loop.rounds):
+        new = []
+        for candidate in tools.progress(closure.find_candidates(builder, recogniser, cfg.loop), "loop"):
+            pair = (candidate.kf_i, candidate.kf_j)
+            done = [c for c in fate.values() if c.T_ij is not None]
+            if any(closure.is_near(candidate, c, span=cfg.loop.closure_spacing) for c in done):
+                continue  # one closure joins its whole neighbourhood: fusion finds the rest
+            fate[pair] = closure.verify(builder, words, candidate, camera, cfg.loop, cfg.sensor, rng)
+            if fate[pair].is_accepted:
+                new.append(fate[pair])
+        if not new:
+            break
+        graph = closure.close(builder, new, cfg.loop)
+        is_kept, chi2 = graph.is_kept[-len(new) :], graph.chi2[-len(new) :]
+        for c, value in zip(itertools.compress(new, ~is_kept), chi2[~is_kept], strict=True):
+            fate[c.kf_i, c.kf_j] = closure.reject(c, f"the pose graph contradicts it (chi2 {value:.0f})")
+        if not is_kept.any():
+            break
+        closure.apply(builder, graph.T_wk)
+        for c in itertools.compress(new, is_kept):
+            closure.fuse_around(builder, c, camera, cfg.loop, cfg.sensor)
+        builder.refresh(np.flatnonzero(builder.lm.is_alive).astype(np.int32))
+        adjustment.adjust(builder, kfs, camera, cfg.sensor, max_iterations=cfg.loop.iterations)
+    return [fate[key] for key in sorted(fate)]
+
+
+def closures_of(accepted: list[Candidate]) -> Closures:
+    """Give accepted closures as an artefact."""
+    return Closures(
+        closure_kf=np.array([(c.kf_i, c.kf_j) for c in accepted], dtype=np.int32).reshape(-1, 2),
+        closure_T_ij=np.array([c.T_ij for c in accepted], dtype=np.float64).reshape(-1, 4, 4),
+        closure_inliers=np.array([c.n_inliers for c in accepted], dtype=np.int32),
+        closure_score=np.array([c.score for c in accepted], dtype=np.float32),
+    )
+
+
+def write_candidates(path: Path, candidates: list[Candidate]) -> None:
+    """Write the table of accepted and rejected candidates with the reason."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(["kf_i", "kf_j", "score", "matches", "inliers", "accepted", "reason"])
+        for c in candidates:
+            writer.writerow([c.kf_i, c.kf_j, f"{c.score:.4f}", c.n_matches, c.n_inliers, int(c.is_accepted), c.reason])
+
+
+def write_pose_graph(path: Path, builder: MapBuilder, accepted: list[Candidate], settings) -> None:
+    """Write the key frames, the edges between them as the final map has them, and the closures as they were measured."""
+    graph = closure.pose_graph(builder, accepted, settings)
+    posegraph.write_g2o(path, builder.kf.T_wk, graph.edge_kf, graph.edge_T_ij, graph.information)

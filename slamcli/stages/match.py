@@ -1,0 +1,51 @@
+"""match: features -> visual words, word vectors, and matches between neighbouring frames. Needs no pose."""
+
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from slamcli import artifacts
+from slamcli.config import MatchConfig
+from slamcli.parallel import ordered_map
+from slamcli.schema import Features, Matches, Words
+from slamcli.vision import hamming, vocabulary
+
+
+def run(inputs, out: Path, cfg, tools) -> dict:
+    """Quantise every feature, make the frames' word vectors, match each frame to those before it."""
+    features, settings = inputs.load(Features, "extract"), cfg.match
+    words = _words(features, vocabulary.load(settings.vocabulary), settings)
+    pairs = [(i, j) for i in range(len(features.stamp)) for j in range(max(0, i - settings.window), i)]
+    found = list(tools.progress(ordered_map(partial(_match, features, words, settings), pairs, workers=tools.workers), "match", len(pairs)))
+    matches = Matches(
+        pair=np.array(pairs, dtype=np.int32).reshape(-1, 2),
+        offset=np.cumsum([0] + [len(rows) for rows, _ in found], dtype=np.int64),
+        row=np.concatenate([np.zeros((0, 2), np.int32), *(rows for rows, _ in found)]),
+        distance=np.concatenate([np.zeros(0, np.uint8), *(distance for _, distance in found)]),
+    )
+    artifacts.save(words, out)
+    artifacts.save(matches, out)
+    return {
+        "frames": len(features.stamp),
+        "pairs": len(pairs),
+        "matches_per_pair": float(np.median(np.diff(matches.offset))) if pairs else 0.0,
+        "words": len(words.idf),
+        "words_seen": len(np.unique(words.bow_word)),
+    }
+
+
+def _words(features: Features, words: vocabulary.Vocabulary, settings: MatchConfig) -> Words:
+    word, node = vocabulary.quantise(words, features.desc, node_level=settings.node_level, margin=settings.node_margin)
+    bow_offset, bow_word, bow_weight = vocabulary.word_vectors(word, features.offset, words.idf)
+    return Words(idf=words.idf, word=word, node=node, bow_offset=bow_offset, bow_word=bow_word, bow_weight=bow_weight)
+
+
+def _match(features: Features, words: Words, settings: MatchConfig, pair: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    i, j = (slice(int(features.offset[frame]), int(features.offset[frame + 1])) for frame in pair)
+    checks = {"max_distance": settings.max_distance, "ratio": settings.ratio, "check_rotation": settings.check_rotation}
+    if settings.method == "brute":
+        return hamming.match_brute(features.desc[i], features.desc[j], features.angle[i], features.angle[j], **checks)
+    return hamming.match_nodes(
+        features.desc[i], words.node[i], features.desc[j], words.node[j], features.angle[i], features.angle[j], **checks
+    )

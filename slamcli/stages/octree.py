@@ -1,0 +1,88 @@
+"""octree: depth images to occupied and free space in the level frame."""
+
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from slamcli.config import OctreeConfig, SensorConfig
+from slamcli.errors import BadFrame
+from slamcli.formats import octomap
+from slamcli.geometry import octree, se3
+from slamcli.geometry.camera import Camera
+from slamcli.mapping import fusion, occupancy
+from slamcli.parallel import ordered_map
+from slamcli.schema import Ground
+from slamcli.stages.densify import depth_poses
+
+RAYS_APART = 0.3  # cells from end point to end point on a near surface
+
+
+def run(inputs: Any, out: Path, cfg: Any, tools: Any) -> dict:
+    """Insert depth images as scans, write `map.ot` and `map.bt`."""
+    dataset, option = inputs.dataset, cfg.octree
+    T_lw = inputs.load(Ground, "densify").T_lw
+    poses = [(frame, T_lw @ T_wc) for frame, T_wc in depth_poses(inputs, frames=option.frames)]
+    grid = occupancy.OccupancyMap(
+        option.resolution, hit=option.hit, miss=option.miss, clamp_min=option.clamp_min, clamp_max=option.clamp_max
+    )
+    n_scans = 0
+    for x_l, origin in scans(
+        dataset, inputs.camera(), tools.progress(poses, "octree"), cfg.sensor, option, workers=tools.workers, warn=tools.warn
+    ):
+        grid.insert(x_l, origin, max_range=option.max_range)
+        n_scans += 1
+    cells = grid.leaves()
+    tree = octree.prune(cells)
+    if not len(tree):
+        tools.warn("the octree is empty: no frame has depth")
+    n_nodes = octomap.write_ot(out / "map.ot", tree, parents=option.parents)
+    octomap.write_bt(out / "map.bt", tree)
+    n_occupied = int(cells.is_occupied().sum())
+    return {
+        "frames": len(dataset),
+        "scans": n_scans,
+        "occupied_cells": n_occupied,
+        "free_cells": len(cells) - n_occupied,
+        "leaves": len(tree),
+        "nodes": n_nodes,
+    }
+
+
+def scans(
+    dataset: Any,
+    camera: Camera,
+    poses: Iterable[tuple[int, np.ndarray]],
+    sensor: SensorConfig,
+    option: OctreeConfig,
+    *,
+    workers: int = 1,
+    warn: Callable[[str], None] = lambda message: None,
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Read frames' depth, cleaned, as scans: end points (N, 3) and origin (3,) in the frame that the poses lead to.
+
+    poses : (frame, camera to that frame when its depth was measured); one without depth, or that cannot be read, gives no scan
+    """
+
+    def scan(item: tuple[int, np.ndarray]) -> tuple[np.ndarray, np.ndarray] | None:
+        frame, T_lk = item
+        try:
+            depth = dataset.depth(frame)
+        except BadFrame as error:
+            warn(str(error))
+            return None
+        if depth is None:
+            return None
+        seen = fusion.surface(
+            depth,
+            camera,
+            settings=option,
+            stride=option.stride,
+            spacing=RAYS_APART * option.resolution,
+            depth_min=sensor.depth_min,
+            depth_max=sensor.depth_max,
+        )
+        return se3.transform(T_lk, seen.xyz_c.astype(np.float64)), T_lk[:3, 3]
+
+    return (item for item in ordered_map(scan, poses, workers=workers) if item is not None)

@@ -1,0 +1,116 @@
+"""Orientation by intensity centroid and rotated BRIEF.
+
+E. Rublee, V. Rabaud, K. Konolige, G. Bradski, ORB: an efficient alternative to SIFT or SURF, ICCV 2011, doi:10.1109/ICCV.2011.6126544
+"""
+
+import numpy as np
+from numba import int16, int32, njit, uint32, uintp
+
+from slamcli.vision.pattern import PAIRS
+
+PATCH_RADIUS = 15  # [px] of the disc whose centroid gives the orientation
+BORDER = 19  # [px] the farthest a rotated test point reaches, ceil(13 sqrt 2)
+
+ROUND = np.float32(1.5 * 2**23)  # adding it leaves a float32 no digits after the point: x + ROUND - ROUND is x rounded, halves to even
+
+_PAIR_X, _PAIR_Y = (np.ascontiguousarray(PAIRS[:, :, axis].T, dtype=np.float32) for axis in (0, 1))
+
+
+def _disc() -> np.ndarray:
+    """Give the half width of each row 0..15 of the disc, made symmetric about the diagonal as in OpenCV."""
+    half = np.zeros(PATCH_RADIUS + 1, dtype=np.int32)
+    middle = int(np.floor(PATCH_RADIUS * np.sqrt(0.5) + 1))
+    for v in range(middle + 1):
+        half[v] = round(np.sqrt(PATCH_RADIUS**2 - v**2))
+    row = 0
+    for v in range(PATCH_RADIUS, int(np.ceil(PATCH_RADIUS * np.sqrt(0.5))) - 1, -1):
+        while half[row] == half[row + 1]:
+            row += 1
+        half[v] = row
+        row += 1
+    return half
+
+
+def _disc_mask() -> np.ndarray:
+    """Give the disc as 255 within 31 rows of 32 pixels: a row is one vector register, so that no row needs a length of its own."""
+    mask = np.zeros((2 * PATCH_RADIUS + 1, 2 * PATCH_RADIUS + 2), dtype=np.uint8)
+    for row, half in enumerate(_disc()[abs(v)] for v in range(-PATCH_RADIUS, PATCH_RADIUS + 1)):
+        mask[row, PATCH_RADIUS - half : PATCH_RADIUS + half + 1] = 255
+    return mask
+
+
+_MASK = _disc_mask()
+
+
+@njit(cache=True, nogil=True)
+def orient(image, xy, mask, angle):
+    """Write each point's orientation [rad, -pi to pi]: the direction from the point to the centroid of the disc around it.
+
+    image : (H, W) uint8; xy : (N, 2) int32, more than PATCH_RADIUS px inside; mask : the disc; angle : (N,) float32
+    """
+    width = image.shape[1]
+    flat = image.ravel()
+    # 16 bits hold a column's sum (31 * 255) and its first moment (at most 15 * 16 / 2 * 255 either way).
+    total, moment = np.empty(32, dtype=np.int16), np.empty(32, dtype=np.int16)
+    for k in range(len(xy)):
+        total[:] = 0
+        moment[:] = 0
+        place = uintp((xy[k, 1] - PATCH_RADIUS) * width + xy[k, 0] - PATCH_RADIUS)
+        for v in range(2 * PATCH_RADIUS + 1):
+            height = int16(v - PATCH_RADIUS)
+            inside = mask[v]
+            for u in range(32):
+                grey = int16(flat[place + uintp(u)] & inside[u])
+                total[u] = int16(total[u] + grey)
+                moment[u] = int16(moment[u] + int16(height * grey))
+            place += uintp(width)
+        m01, m10 = 0, 0
+        for u in range(32):
+            m10 += (u - PATCH_RADIUS) * int32(total[u])
+            m01 += int32(moment[u])
+        angle[k] = np.arctan2(np.float32(m01), np.float32(m10))
+
+
+@njit(cache=True, nogil=True)
+def describe(smooth, xy, angle, pair_x, pair_y, desc):
+    """Write the 256 comparisons of each point's turned test pattern as bits, lowest bit first.
+
+    smooth : (H, W) uint8, blurred; xy : (N, 2) int32, at least BORDER px inside; pair_x, pair_y : (2, 256) float32, the first and the
+    second points of the pairs; desc : (N, 32) uint8
+    """
+    width = smooth.shape[1]
+    flat = smooth.ravel()
+    corner = np.float32(BORDER * width + BORDER)  # keeps places positive: negative ones would be tested for and wrapped
+    a, b = np.empty(256, dtype=np.uint32), np.empty(256, dtype=np.uint32)
+    for k in range(len(xy)):
+        cos, sin = np.cos(angle[k]), np.sin(angle[k])
+        for p in range(256):
+            a[p] = uint32(_place(pair_x[0, p], pair_y[0, p], cos, sin, np.float32(width)) + corner)
+            b[p] = uint32(_place(pair_x[1, p], pair_y[1, p], cos, sin, np.float32(width)) + corner)
+        patch = flat[(xy[k, 1] - BORDER) * width + xy[k, 0] - BORDER :]
+        for byte in range(32):
+            value = 0
+            for bit in range(8):
+                p = 8 * byte + bit
+                value |= (patch[a[p]] < patch[b[p]]) << bit
+            desc[k, byte] = value
+
+
+@njit(nogil=True)
+def _place(x, y, cos, sin, width):
+    """Turn a test point and give its place in the flat image, relative to the key point; float32 is exact up to 2^24."""
+    return ((x * sin + y * cos + ROUND) - ROUND) * width + ((x * cos - y * sin + ROUND) - ROUND)
+
+
+def orientation(image: np.ndarray, xy: np.ndarray) -> np.ndarray:
+    """Give the orientation (N,) float32 [rad] of points xy (N, 2) int32 of a grey image."""
+    angle = np.empty(len(xy), dtype=np.float32)
+    orient(image, xy, _MASK, angle)
+    return angle
+
+
+def descriptors(smooth: np.ndarray, xy: np.ndarray, angle: np.ndarray) -> np.ndarray:
+    """Give the descriptors (N, 32) uint8 of points xy (N, 2) int32 with orientation angle (N,) [rad] of a blurred image."""
+    desc = np.empty((len(xy), 32), dtype=np.uint8)
+    describe(smooth, xy, angle, _PAIR_X, _PAIR_Y, desc)
+    return desc

@@ -1,0 +1,177 @@
+"""Matching of binary descriptors by Hamming distance: all with all, or only those under one vocabulary node."""
+
+import numpy as np
+from numba import int32, njit
+
+from slamcli.geometry.bits import popcount
+
+BINS = 30  # of the histogram of turns between matched points
+KEPT_BINS = 3
+FAR = 257  # [bits] more than two descriptors can differ by
+NODE_RATIO = (
+    0.975  # among the few under a node the second nearest is farther than among all; this makes up for it: precision as of brute force
+)
+
+Match = tuple[np.ndarray, np.ndarray]
+
+
+@njit(cache=True, nogil=True)
+def _compare(desc_i, block, desc_j, row_of_entry, best, following, choice, best_j, choice_j):
+    """Keep for each row of i the smallest distance, whose it is, and the next smallest; and for each row of j the smallest. Ties: the first.
+
+    desc_i : (N, 4) uint64; block : (N, B, 2) int32, start and stop of the entries each row of i is compared with
+    desc_j : (4, E) uint64, entries, those of a node side by side; row_of_entry : (E,) int32, a row of j may have several
+
+    First all distances of a block, then their minima: the first loop has no branch, so several descriptors go in one instruction.
+    """
+    b0, b1, b2, b3 = desc_j[0], desc_j[1], desc_j[2], desc_j[3]
+    distance = np.empty(len(row_of_entry), dtype=np.int32)
+    for i in range(len(desc_i)):
+        a0, a1, a2, a3 = desc_i[i, 0], desc_i[i, 1], desc_i[i, 2], desc_i[i, 3]
+        least, second, nearest = int32(FAR), int32(FAR), int32(-1)
+        for b in range(block.shape[1]):
+            start, stop = block[i, b, 0], block[i, b, 1]
+            if start == stop:
+                continue
+            c0, c1, c2, c3 = b0[start:stop], b1[start:stop], b2[start:stop], b3[start:stop]
+            for e in range(stop - start):
+                distance[e] = int32(popcount(a0 ^ c0[e]) + popcount(a1 ^ c1[e]) + popcount(a2 ^ c2[e]) + popcount(a3 ^ c3[e]))
+            rows = row_of_entry[start:stop]
+            for e in range(stop - start):
+                d, j = distance[e], rows[e]
+                if d < best_j[j]:
+                    best_j[j], choice_j[j] = d, i
+                if d < second and j != nearest:
+                    if d < least:
+                        least, second, nearest = d, least, j
+                    else:
+                        second = d
+        best[i], following[i], choice[i] = least, second, nearest
+
+
+@njit(cache=True, nogil=True)
+def _accept(best, following, choice, choice_j, max_distance, ratio, rows):
+    """List the matches that pass distance and ratio and are each other's nearest; rows : (N, 2) int32. Returns their number."""
+    n = 0
+    for i in range(len(best)):
+        if best[i] <= max_distance and best[i] < ratio * following[i] and choice_j[choice[i]] == i:
+            rows[n, 0], rows[n, 1] = i, choice[i]
+            n += 1
+    return n
+
+
+@njit(cache=True, nogil=True)
+def _group(node_i, node_j, start, block, row_of_entry):
+    """Sort the rows of j by node, those whose first node it is before those whose second it is, and find each row of i its blocks.
+
+    start : (2 n_nodes + 1,) int32 of zeros. A counting sort; returns the number of entries.
+    """
+    for j in range(len(node_j)):
+        for c in range(node_j.shape[1]):
+            if node_j[j, c] >= 0:
+                start[2 * node_j[j, c] + c + 1] += 1
+    for k in range(1, len(start)):
+        start[k] += start[k - 1]
+    place = start.copy()
+    for j in range(len(node_j)):
+        for c in range(node_j.shape[1]):
+            if node_j[j, c] >= 0:
+                k = 2 * node_j[j, c] + c
+                row_of_entry[place[k]] = j
+                place[k] += 1
+    for i in range(len(node_i)):
+        first = 2 * node_i[i, 0]
+        block[i, 0, 0], block[i, 0, 1] = start[first], start[first + 2]
+        if node_i.shape[1] > 1 and node_i[i, 1] >= 0:
+            second = 2 * node_i[i, 1]
+            block[i, 1, 0], block[i, 1, 1] = start[second], start[second + 1]
+    return start[len(start) - 1]
+
+
+def as_words(desc: np.ndarray) -> np.ndarray:
+    """View descriptors (N, 32) uint8 as (N, 4) uint64, the form the kernels compare."""
+    return np.ascontiguousarray(desc, dtype=np.uint8).reshape(-1, 32).view(np.uint64)
+
+
+def match_brute(
+    desc_i: np.ndarray, desc_j: np.ndarray, angle_i: np.ndarray, angle_j: np.ndarray,
+    *, max_distance: int = 64, ratio: float = 0.8, check_rotation: bool = True,
+) -> Match:  # fmt: skip
+    """Match two sets of descriptors by comparing all with all.
+
+    desc : (N, 32) uint8; angle : (N,) [rad]
+    max_distance [bits]; ratio : the nearest must be closer than this share of the second nearest's distance
+    check_rotation : keep only matches whose turn agrees with most, see `_keep_agreeing`
+    Returns rows (Q, 2) int32, increasing in the first column, and distances (Q,) uint8. Each is the other's nearest.
+    """
+    block = np.empty((len(desc_i), 1, 2), dtype=np.int32)
+    block[:] = 0, len(desc_j)
+    row_of_entry = np.arange(len(desc_j), dtype=np.int32)
+    return _match(desc_i, block, desc_j, row_of_entry, angle_i, angle_j, max_distance, ratio, check_rotation)
+
+
+def match_nodes(
+    desc_i: np.ndarray, node_i: np.ndarray, desc_j: np.ndarray, node_j: np.ndarray, angle_i: np.ndarray, angle_j: np.ndarray,
+    *, max_distance: int = 64, ratio: float = 0.8, check_rotation: bool = True,
+) -> Match:  # fmt: skip
+    """Match as `match_brute` does, comparing only descriptors with a vocabulary node in common.
+
+    node : (N,) int32, or (N, 2) where the second is the node a descriptor nearly fell under, -1 for none. Then two are compared where
+    one's first is the other's first or second. The ratio is tightened by NODE_RATIO.
+    """
+    node_i, node_j = (
+        np.ascontiguousarray(node, dtype=np.int32).reshape(len(node), 1 if np.ndim(node) == 1 else 2) for node in (node_i, node_j)
+    )
+    n_nodes = 1 + max(int(node_i.max(initial=0)), int(node_j.max(initial=0)))
+    block = np.zeros((len(node_i), node_i.shape[1], 2), dtype=np.int32)
+    row_of_entry = np.empty(node_j.size, dtype=np.int32)
+    row_of_entry = row_of_entry[: _group(node_i, node_j, np.zeros(2 * n_nodes + 1, dtype=np.int32), block, row_of_entry)]
+    return _match(desc_i, block, desc_j, row_of_entry, angle_i, angle_j, max_distance, ratio * NODE_RATIO, check_rotation)
+
+
+@njit(cache=True, nogil=True)
+def _keep_agreeing(rows, angle_i, angle_j):
+    """Keep in place the matches whose turn falls in the three fullest of thirty bins of a full circle; returns their number.
+
+    A bin that holds less than a tenth of the fullest is left out; of equally full ones the first counts.
+    """
+    count = np.zeros(BINS, dtype=np.int32)
+    bin_of = np.empty(len(rows), dtype=np.int32)
+    for k in range(len(rows)):
+        turn = (np.float64(angle_i[rows[k, 0]]) - np.float64(angle_j[rows[k, 1]])) * (BINS / (2.0 * np.pi))
+        bin_of[k] = int(np.floor(turn + 0.5)) % BINS
+        count[bin_of[k]] += 1
+    is_kept = np.zeros(BINS, dtype=np.bool_)
+    fullest = -1
+    for _ in range(KEPT_BINS):
+        best = 0
+        for b in range(1, BINS):
+            if count[b] > count[best]:
+                best = b
+        fullest = max(fullest, count[best])
+        is_kept[best] = 10 * count[best] >= fullest
+        count[best] = -1
+    n = 0
+    for k in range(len(rows)):
+        if is_kept[bin_of[k]]:
+            rows[n, 0], rows[n, 1] = rows[k, 0], rows[k, 1]
+            n += 1
+    return n
+
+
+def _match(desc_i, block, desc_j, row_of_entry, angle_i, angle_j, max_distance, ratio, check_rotation) -> Match:
+    words_i, words_j = as_words(desc_i), as_words(desc_j)
+    n_i, n_j = len(words_i), len(words_j)
+    if (len(block), len(angle_i), len(angle_j)) != (n_i, n_i, n_j) or row_of_entry.max(initial=-1) >= n_j:
+        raise ValueError("descriptors, nodes and angles of a frame differ in number")
+    best, following, choice = (np.empty(n_i, dtype=np.int32) for _ in range(3))
+    best_j, choice_j = np.full(n_j, FAR, dtype=np.int32), np.full(n_j, -1, dtype=np.int32)
+    entries = np.ascontiguousarray(words_j[row_of_entry].T)
+    _compare(words_i, block, entries, row_of_entry, best, following, choice, best_j, choice_j)
+    rows = np.empty((n_i, 2), dtype=np.int32)
+    rows = rows[: _accept(best, following, choice, choice_j, min(int(max_distance), FAR - 1), float(ratio), rows)]
+    if check_rotation:
+        rows = rows[
+            : _keep_agreeing(rows, np.ascontiguousarray(angle_i, dtype=np.float32), np.ascontiguousarray(angle_j, dtype=np.float32))
+        ]
+    return rows, best[rows[:, 0]].astype(np.uint8)

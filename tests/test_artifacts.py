@@ -1,0 +1,144 @@
+"""Records of arrays: what is saved comes back, and nothing that a type does not declare gets in or out."""
+
+import dataclasses
+import io
+import pickle
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from slamcli import artifacts, schema
+from slamcli.errors import SlamError
+from slamcli.schema import array
+
+
+@dataclass(frozen=True)
+class Ragged:
+    """A type with every kind of shape."""
+
+    offset: np.ndarray = array("i8", "F+1", "rows")
+    xy: np.ndarray = array("f4", "M 2", "px")
+    depth: np.ndarray = array("f4", "M", "m")
+    total: np.ndarray = array("f8", "", "scalar")
+    is_found: np.ndarray = array("?", "", "scalar")
+
+
+def ragged(frames: int = 2, rows: int = 5) -> Ragged:
+    values = np.arange(2 * rows, dtype="f4").reshape(rows, 2)
+    return Ragged(np.zeros(frames + 1, "i8"), values, np.full(rows, np.nan, "f4"), np.float64(0.1), np.bool_(True))
+
+
+@given(frames=st.integers(0, 5), rows=st.integers(0, 7))
+def test_load_gives_what_save_got(tmp_path_factory: pytest.TempPathFactory, frames: int, rows: int) -> None:
+    folder, value = tmp_path_factory.mktemp("record"), ragged(frames, rows)
+    artifacts.save(value, folder)
+    back = artifacts.load(Ragged, folder)
+    for spec in dataclasses.fields(Ragged):
+        before, after = np.asarray(getattr(value, spec.name)), getattr(back, spec.name)
+        assert type(after) is np.ndarray
+        assert after.dtype == before.dtype
+        np.testing.assert_array_equal(after, before)
+
+
+def test_the_same_value_gives_the_same_bytes_whatever_its_memory_layout(tmp_path: Path) -> None:
+    value = ragged(2, 4)
+    for name, laid_out in (("c", value.xy), ("fortran", np.asfortranarray(value.xy)), ("strided", np.repeat(value.xy, 2, axis=0)[::2])):
+        (tmp_path / name).mkdir()
+        artifacts.save(dataclasses.replace(value, xy=laid_out), tmp_path / name)
+    contents = {(tmp_path / name / "xy.npy").read_bytes() for name in ("c", "fortran", "strided")}
+    assert len(contents) == 1
+
+
+def test_writing_to_a_loaded_array_never_reaches_the_file(tmp_path: Path) -> None:
+    artifacts.save(ragged(), tmp_path)
+    artifacts.load(Ragged, tmp_path).xy[:] = -1.0
+    np.testing.assert_array_equal(artifacts.load(Ragged, tmp_path).xy, ragged().xy)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"depth": np.zeros(4, "f4")}, r"Ragged.depth: shape \(4,\) does not fit \['M'\] with {'F': 2, 'M': 5}"),
+        ({"depth": np.zeros(5, "f8")}, "Ragged.depth: dtype float64 is not float32"),
+        ({"xy": np.zeros((5, 3), "f4")}, r"Ragged.xy: shape \(5, 3\) does not fit"),
+        ({"xy": np.zeros(5, "f4")}, r"Ragged.xy: shape \(5,\) does not fit"),
+        ({"offset": np.zeros(0, "i8")}, r"Ragged.offset: shape \(0,\) does not fit \['F\+1'\]"),
+        ({"total": np.zeros(1)}, r"Ragged.total: shape \(1,\) does not fit \[\]"),
+        ({"is_found": 1}, "Ragged.is_found: dtype int64 is not bool"),
+    ],
+)
+def test_what_does_not_fit_the_declaration_is_never_saved(tmp_path: Path, change: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        artifacts.save(dataclasses.replace(ragged(), **change), tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+def test_two_types_in_one_folder_must_not_share_a_field(tmp_path: Path) -> None:
+    artifacts.save(ragged(), tmp_path)
+    with pytest.raises(ValueError, match="offset.npy is already written"):
+        artifacts.save(ragged(), tmp_path)
+
+
+def hostile(kind: str, good: bytes) -> bytes:
+    header = b"{'descr': '<f4', 'fortran_order': False, 'shape': (4611686018427387904,), }"
+    text = {
+        "empty": b"",
+        "cut in the data": good[:-4],
+        "cut in the header": good[:20],
+        "not npy": b"PK\x03\x04 nothing of the kind",
+        "pickle": pickle.dumps([1, 2]),
+        "enormous": b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header,
+        "code in the header": b"\x93NUMPY\x01\x00" + (20).to_bytes(2, "little") + b"__import__('os')    ",
+    }
+    if kind == "objects":
+        buffer = io.BytesIO()
+        np.save(buffer, np.array([{}], dtype=object), allow_pickle=True)
+        return buffer.getvalue()
+    if kind == "other dtype":
+        buffer = io.BytesIO()
+        np.save(buffer, np.zeros(5, "f8"))
+        return buffer.getvalue()
+    return text[kind]
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [
+        "empty",
+        "cut in the data",
+        "cut in the header",
+        "not npy",
+        "pickle",
+        "enormous",
+        "code in the header",
+        "objects",
+        "other dtype",
+    ],
+)
+def test_a_damaged_or_hostile_file_gives_one_line_that_names_it(tmp_path: Path, kind: str) -> None:
+    artifacts.save(ragged(), tmp_path)
+    path = tmp_path / "depth.npy"
+    path.write_bytes(hostile(kind, path.read_bytes()))
+    with pytest.raises(SlamError, match=r"depth.*slamcli run --force$") as caught:
+        artifacts.load(Ragged, tmp_path)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_missing_file_gives_one_line_that_names_it(tmp_path: Path) -> None:
+    artifacts.save(ragged(), tmp_path)
+    (tmp_path / "xy.npy").unlink()
+    with pytest.raises(SlamError, match="xy.npy is not there"):
+        artifacts.load(Ragged, tmp_path)
+
+
+def test_every_core_type_declares_dtype_shape_and_meaning_of_each_field() -> None:
+    types = [value for value in vars(schema).values() if dataclasses.is_dataclass(value)]
+    assert len(types) >= 8
+    for kind in types:
+        for spec in dataclasses.fields(kind):
+            assert isinstance(spec.metadata["dtype"], np.dtype), f"{kind.__name__}.{spec.name}"
+            assert spec.metadata["meaning"], f"{kind.__name__}.{spec.name}"

@@ -1,0 +1,70 @@
+"""The camera: laws of projection and distortion, OpenCV as oracle, intrinsics that cannot be right."""
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from slamcli.errors import SlamError
+from slamcli.geometry.camera import Camera
+
+FREIBURG1 = Camera(640, 480, 517.306408, 516.469215, 318.643040, 255.313989, 0.262383, -0.953104, -0.005358, 0.002628, 1.163314)
+
+
+@given(st.floats(-5.0, 5.0), st.floats(-5.0, 5.0), st.floats(0.2, 20.0))
+def test_projection_inverts_backprojection(x, y, z):
+    point = np.array([x, y, z])
+    xy = FREIBURG1.project(point)
+    np.testing.assert_allclose(FREIBURG1.backproject(xy, np.array(z)), point, atol=1e-9)
+
+
+def test_undistortion_inverts_distortion_all_over_the_image():
+    u, v = np.meshgrid(np.linspace(0, 639, 30), np.linspace(0, 479, 30))
+    raw = np.stack([u.ravel(), v.ravel()], axis=1)
+    np.testing.assert_allclose(FREIBURG1.distort(FREIBURG1.undistort(raw)), raw, atol=1e-4)
+
+
+def test_distortion_agrees_with_opencv():
+    rng = np.random.default_rng(0)
+    x_c = np.concatenate([rng.uniform(-0.5, 0.5, (50, 2)), np.ones((50, 1))], axis=1)
+    coefficients = np.array([FREIBURG1.k1, FREIBURG1.k2, FREIBURG1.p1, FREIBURG1.p2, FREIBURG1.k3])
+    expected, _ = cv2.projectPoints(x_c, np.zeros(3), np.zeros(3), FREIBURG1.K, coefficients)
+    np.testing.assert_allclose(FREIBURG1.distort(FREIBURG1.project(x_c)), expected[:, 0], atol=1e-9)
+
+
+def test_rays_lift_a_depth_image():
+    camera = Camera(8, 6, 10.0, 11.0, 3.5, 2.5)
+    assert camera.rays.shape == (6, 8, 2)
+    np.testing.assert_allclose(camera.rays[4, 7], [(7 - 3.5) / 10.0, (4 - 2.5) / 11.0], rtol=1e-6)
+
+
+def test_dict_round_trip():
+    assert Camera.from_dict(FREIBURG1.to_dict(), source="camera.json") == FREIBURG1
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        ({"fx": 0.0}, "fx"),
+        ({"fx": float("nan")}, "fx"),
+        ({"fx": 1e9}, "focal length"),
+        ({"cx": -3.0}, "principal point"),
+        ({"width": 0}, "width"),
+        ({"width": 640.5}, "width"),
+        ({"depth_scale": 0.0}, "depth_scale"),
+        ({"fx": "517"}, "fx"),
+        ({"focal": 3.0}, "'focal' is not known"),
+    ],
+)
+def test_intrinsics_that_cannot_be_right(change, message):
+    with pytest.raises(SlamError, match=message) as caught:
+        Camera.from_dict(FREIBURG1.to_dict() | change, source="mine.toml")
+    assert str(caught.value).startswith("mine.toml")
+
+
+def test_missing_key():
+    values = FREIBURG1.to_dict()
+    del values["fy"]
+    with pytest.raises(SlamError, match="'fy' is missing"):
+        Camera.from_dict(values, source="mine.toml")

@@ -1,0 +1,110 @@
+"""Loops: true revisits are found and pull drift out, look-alikes and unverifiable ones are rejected with a reason; hindsight."""
+
+import numpy as np
+import pytest
+from scenes import CAMERA, ape, observe, orbit, room_points
+
+from slamcli.config import LoopConfig, SensorConfig, TrackConfig
+from slamcli.geometry import se3
+from slamcli.mapping import adjustment, closure, hindsight
+from slamcli.mapping.mapbuilder import MapBuilder
+from slamcli.mapping.tracker import Tracker
+from slamcli.schema import LOST, frame_poses
+
+SENSOR, SETTINGS = SensorConfig(pixel_noise=0.5), LoopConfig()
+
+
+@pytest.fixture(scope="module")
+def turn():
+    """A turn and a bit inside a round room, tracked."""
+    rng = np.random.default_rng(0)
+    scene = observe(orbit(150, turns=1.1), room_points(9000, rng), rng)
+    tracker = Tracker(scene.features, scene.words, scene.matches, CAMERA, TrackConfig(), SENSOR, np.random.default_rng(0))
+    for i in range(150):
+        tracker.process(i)
+    assert (tracker.state != LOST).all()
+    return scene, tracker.tracks(), tracker.map()
+
+
+def drifted(scene, map_, per_key_frame: np.ndarray) -> MapBuilder:
+    """Rebuild the map with an error that grows from key frame to key frame, landmarks and all."""
+    builder = MapBuilder.from_map(scene.features, map_)
+    T_wk = builder.kf.T_wk.copy()
+    for k in range(1, len(T_wk)):
+        step = se3.inverse(map_.T_wk[k - 1]) @ map_.T_wk[k] @ se3.exp(per_key_frame)
+        T_wk[k] = T_wk[k - 1] @ step
+    closure.apply(builder, T_wk)
+    return builder
+
+
+def verified(scene, builder) -> list[closure.Candidate]:
+    recogniser = closure.Recogniser(scene.words, builder.kf.frame)
+    rng = np.random.default_rng(1)
+    candidates = closure.find_candidates(builder, recogniser, SETTINGS)
+    return [closure.verify(builder, scene.words, c, CAMERA, SETTINGS, SENSOR, rng) for c in candidates]
+
+
+def test_similarity_is_symmetric_and_one_for_itself(turn):
+    scene, _, map_ = turn
+    recogniser = closure.Recogniser(scene.words, map_.kf_frame)
+    scores = np.array([recogniser.scores(k) for k in range(len(map_.kf_frame))])
+    np.testing.assert_allclose(np.diag(scores), 1.0, atol=1e-5)
+    np.testing.assert_allclose(scores, scores.T, atol=1e-6)
+
+
+def test_every_accepted_closure_is_true_and_the_revisit_is_found(turn):
+    scene, _, map_ = turn
+    builder = drifted(scene, map_, np.array([0.002, 0.001, 0.0, 0.0, 0.0005, 0.0]))
+    accepted = [c for c in verified(scene, builder) if c.is_accepted]
+    assert any(c.kf_i > 0.9 * len(builder.kf) and c.kf_j < 0.15 * len(builder.kf) for c in accepted)
+    true = scene.T_gc[map_.kf_frame]
+    for c in accepted:
+        error = se3.log(se3.inverse(se3.inverse(true[c.kf_i]) @ true[c.kf_j]) @ c.T_ij)
+        assert np.linalg.norm(error[:3]) < 0.05 and np.linalg.norm(error[3:]) < 0.02
+
+
+def test_closing_takes_the_drift_out(turn):
+    scene, _, map_ = turn
+    builder = drifted(scene, map_, np.array([0.003, 0.001, 0.0, 0.0, 0.001, 0.0]))
+    true = scene.T_gc[map_.kf_frame]
+    before = ape(builder.kf.T_wk, true)
+    accepted = [c for c in verified(scene, builder) if c.is_accepted]
+    graph = closure.close(builder, accepted, SETTINGS)
+    closure.apply(builder, graph.T_wk)
+    fused = sum(closure.fuse_around(builder, c, CAMERA, SETTINGS, SENSOR) for c in accepted)
+    adjustment.adjust(builder, np.arange(len(builder.kf), dtype=np.int32), CAMERA, SENSOR, max_iterations=30)
+    after = ape(builder.kf.T_wk, true)
+    assert fused > 50
+    assert before > 0.02 and 1e-4 < after < before / 3
+
+
+def test_a_planted_false_closure_is_dropped(turn):
+    scene, _, map_ = turn
+    builder = MapBuilder.from_map(scene.features, map_)
+    accepted = [c for c in verified(scene, builder) if c.is_accepted]
+    n = len(builder.kf)
+    false = closure.Candidate(n // 2, 2, 0.4, 100, 200, T_ij=se3.exp(np.array([0.4, 0.1, 0.2, 0.0, 0.3, 0.0])))
+    honest, fooled = closure.close(builder, accepted, SETTINGS), closure.close(builder, [*accepted, false], SETTINGS)
+    assert not fooled.is_kept[-1]
+    true = scene.T_gc[map_.kf_frame]
+    assert ape(fooled.T_wk, true) < 1.1 * ape(honest.T_wk, true)
+
+
+def test_rejected_candidates_say_why(turn):
+    scene, _, map_ = turn
+    builder = MapBuilder.from_map(scene.features, map_)
+    strangers = closure.Candidate(len(builder.kf) // 2, 0, 0.9)
+    rng = np.random.default_rng(2)
+    fate = closure.verify(builder, scene.words, strangers, CAMERA, SETTINGS, SENSOR, rng)
+    assert not fate.is_accepted and "of 20 matches" in fate.reason
+
+
+def test_hindsight_finds_lost_frames_and_keeps_the_rest(turn):
+    scene, tracks, map_ = turn
+    tracks.state[40:44], tracks.ref_kf[40:44] = LOST, -1
+    tracks.T_kc[40:44] = np.nan
+    builder = MapBuilder.from_map(scene.features, map_)
+    after = hindsight.refine_frames(builder, tracks, CAMERA, SENSOR, TrackConfig(), lambda items, label: items)
+    assert (after.state != LOST).all()
+    error = [ape(frame_poses(t, map_), scene.T_gc) for t in (tracks, after)]
+    assert 1e-4 < error[1] < error[0] + 0.001

@@ -1,0 +1,94 @@
+"""Progress, tables and the line that tells a finished stage; what a stage costs."""
+
+import io
+import logging
+import sys
+import time
+
+import numpy as np
+import pytest
+from numba import njit
+
+from slamcli import console
+from slamcli.meter import Meter
+
+
+class Terminal(io.StringIO):
+    """A stderr that someone looks at."""
+
+    def isatty(self) -> bool:
+        return True
+
+
+def test_progress_is_silent_where_nobody_looks(capsys: pytest.CaptureFixture) -> None:
+    assert list(console.progress(range(3), "track")) == [0, 1, 2]
+    assert capsys.readouterr() == ("", "")
+
+
+def test_progress_shows_a_bar_with_the_unit_of_the_label(monkeypatch: pytest.MonkeyPatch) -> None:
+    for label, unit in (("track", "frames"), ("unpack [files]", "files")):
+        screen = Terminal()
+        monkeypatch.setattr(sys, "stderr", screen)
+        assert list(console.progress(iter(range(3)), label, 3)) == [0, 1, 2]
+        assert label.split()[0] in screen.getvalue()
+        assert f" {unit}/s" in screen.getvalue()
+
+
+def test_a_message_goes_above_the_bar(monkeypatch: pytest.MonkeyPatch) -> None:
+    screen = Terminal()
+    monkeypatch.setattr(sys, "stderr", screen)
+    console.set_up(0)
+    for _ in console.progress(range(2), "track"):
+        logging.getLogger("slamcli.test").warning("frame is dark")
+    assert "Warning: frame is dark\n" in screen.getvalue()
+
+
+def test_table_aligns_columns() -> None:
+    assert console.table([["a", "1", "x"], ["bbb", "22"]], right=[1]) == "a     1  x\nbbb  22"
+
+
+def record(**changes: object) -> dict:
+    base = {"stage": "track", "seconds": 14.2, "fps": 95.9, "compile_seconds": 0.0, "n_warnings": 0}
+    return {**base, "summary": {"frames": 1362, "key_frames": 173, "rms": 0.51234, "cost": [2, 1]}, **changes}
+
+
+def test_a_finished_stage_is_told_in_one_line() -> None:
+    assert console.stage_line(record()) == "track      1362 frames  14.2 s  95.9 fps  key frames 173  rms 0.5123"
+    assert "3 warnings" in console.stage_line(record(n_warnings=3))
+    assert "4.5 s of it compiling kernels, this once" in console.stage_line(record(compile_seconds=4.5))
+    assert console.stage_line(record(summary={}, fps=None)) == "track      14.2 s"
+
+
+def test_the_meter_sees_time_memory_and_cpu() -> None:
+    with Meter() as idle:
+        time.sleep(0.2)
+    assert 0.2 <= idle.seconds < 5
+    assert 0 <= idle.cpu_seconds < 0.15
+    with Meter() as busy:
+        held = np.ones(32 << 20)  # 256 MiB
+        time.sleep(0.1)
+        del held
+    assert 200 < busy.peak_rss_mb - idle.peak_rss_mb < 320
+    assert busy.cpu_seconds > 0.01
+
+
+def test_the_meter_counts_compilation_and_says_so_once(capsys: pytest.CaptureFixture) -> None:
+    @njit
+    def inner(x):
+        return x + 1.0
+
+    @njit
+    def outer(x):
+        return inner(x) * 2.0
+
+    with Meter() as meter:
+        meter.watch_compiler()
+        outer(1.0)
+        inner(1)
+    assert 0 < meter.compile_seconds <= meter.seconds
+    assert capsys.readouterr().err.count("compiling kernels") == 1
+    with Meter() as again:
+        again.watch_compiler()
+        outer(1.0)
+    assert again.compile_seconds == 0
+    assert capsys.readouterr().err == ""

@@ -1,0 +1,210 @@
+"""Corners, spreading, orientation, descriptors: kernels against their twins and against OpenCV."""
+
+import cv2
+import naive
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from slamcli.vision import brief, fast, filters, quadtree
+from slamcli.vision.pattern import PAIRS
+
+seeds = st.integers(0, 2**32 - 1)
+
+
+def texture(seed: int, height: int, width: int) -> np.ndarray:
+    """Blobs, edges and noise; some pictures low in contrast, some saturated."""
+    rng = np.random.default_rng(seed)
+    coarse = cv2.resize(rng.normal(0, 1, (max(2, height // 6), max(2, width // 6))), (width, height), interpolation=cv2.INTER_CUBIC)
+    grey = 128 + rng.choice([4, 40, 200]) * coarse + rng.normal(0, rng.choice([0.0, 3.0]), (height, width))
+    return np.clip(grey, 0, 255).astype(np.uint8)
+
+
+@settings(max_examples=25, deadline=None)
+@given(seeds, st.integers(7, 24), st.integers(7, 40))
+def test_the_fast_score_is_that_of_the_definition(seed: int, height: int, width: int) -> None:
+    image, score = texture(seed, height, width), np.full((height, width), 77, np.uint8)
+    fast.corner_score(image, 3, score)
+    np.testing.assert_array_equal(score, naive.fast_score(image))
+
+
+def test_a_margin_leaves_the_inside_as_it_is() -> None:
+    image = texture(1, 40, 50)
+    whole, inside = np.empty_like(image), np.full_like(image, 9)
+    fast.corner_score(image, 3, whole)
+    fast.corner_score(image, 12, inside)
+    np.testing.assert_array_equal(inside[12:-12, 12:-12], whole[12:-12, 12:-12])
+    inside[12:-12, 12:-12] = 0
+    assert not inside.any()
+
+
+@pytest.mark.parametrize("threshold", [1, 7, 20, 60])
+def test_a_corner_is_where_opencv_finds_one(threshold: int) -> None:
+    image = texture(3, 120, 160)
+    score = np.empty_like(image)
+    fast.corner_score(image, 3, score)
+    expected = np.zeros(image.shape, dtype=bool)
+    for point in cv2.FastFeatureDetector_create(threshold, False).detect(image):
+        expected[int(point.pt[1]), int(point.pt[0])] = True
+    assert expected.any()
+    np.testing.assert_array_equal(score > threshold, expected)
+
+
+@pytest.mark.parametrize("grey", [0, 128, 255])
+def test_a_constant_image_has_no_corner(grey: int) -> None:
+    found = fast.corners(np.full((90, 120), grey, np.uint8), border=19, cell=30, threshold=20, threshold_low=1)
+    assert len(found.xy) == len(found.response) == 0
+
+
+@settings(max_examples=25, deadline=None)
+@given(seeds, st.integers(40, 90), st.integers(40, 90), st.sampled_from([7, 30, 200]), st.booleans())
+def test_cells_fall_back_as_the_twin_says(seed: int, height: int, width: int, cell: int, only_best: bool) -> None:
+    image, (high, low) = texture(seed, height, width), (25, 5)
+    score = np.empty_like(image)
+    fast.corner_score(image, 3, score)
+    peak = naive.local_maxima(score, low)
+    room = height * width
+    expected = naive.cell_corners(peak, 19, cell, high, only_best)
+    found = fast.corners(image, border=19, cell=cell, threshold=high, threshold_low=low, at_most=room if only_best else 0)
+    assert [tuple(at) for at in found.xy.tolist()] == expected
+
+
+def test_the_threshold_rises_until_about_as_many_corners_are_left_as_asked_for() -> None:
+    image = texture(12, 240, 320)
+    every = fast.corners(image, border=19, cell=400, threshold=5, threshold_low=5, rank_by="fast")
+    strongest = fast.corners(image, border=19, cell=400, threshold=5, threshold_low=5, at_most=100, rank_by="fast")
+    assert 100 <= len(strongest.xy) < len(every.xy)
+    least = strongest.response.min()
+    assert (every.response > least).sum() < 100, "a higher threshold would have left too few"
+    assert len(strongest.xy) == (every.response >= least).sum()
+
+
+def test_the_response_is_the_papers_sum() -> None:
+    image = texture(5, 100, 100)
+    found = fast.corners(image, border=19, cell=30, threshold=10, threshold_low=5)
+    grey = image.astype(int)
+    expected = [sum(abs(grey[y + dy, x + dx] - grey[y, x]) for dx, dy in naive.CIRCLE) for x, y in found.xy]
+    np.testing.assert_array_equal(found.response, expected)
+
+
+@pytest.mark.parametrize("shift", [(0.3, -0.4), (-0.25, 0.1), (0.5, 0.5)])
+def test_the_summit_follows_a_shift_of_less_than_a_pixel(shift: tuple[float, float]) -> None:
+    tiles = np.kron(np.random.default_rng(8).uniform(40, 220, (50, 50)), np.ones((40, 40)))  # four times as fine as the images
+    images = []
+    for dx, dy in ((0, 0), shift):
+        turned = np.float32([[0.9, -0.4, 300 + 4 * dx], [0.4, 0.9, -300 + 4 * dy]])
+        moved = cv2.warpAffine(tiles, turned, (1280, 960), flags=cv2.INTER_LINEAR)
+        image = cv2.resize(cv2.GaussianBlur(moved, (0, 0), 3), (320, 240), interpolation=cv2.INTER_AREA).astype(np.uint8)
+        images.append(filters.blur_1px(image))
+    a, b = (fast.corners(image, border=19, cell=30, threshold=8, threshold_low=5) for image in images)
+    apart = (b.xy[None] - a.xy[:, None]).astype(float)
+    nearest = np.abs(apart).sum(axis=2).argmin(axis=1)
+    whole = apart[np.arange(len(nearest)), nearest]
+    is_same = np.abs(whole).max(axis=1) <= 1
+    fine = b.summits(nearest) - a.summits(np.arange(len(nearest)))
+    assert is_same.sum() > 100
+    rough, better = (np.sqrt(np.mean((moved[is_same] - shift) ** 2)) for moved in (whole, fine))
+    assert 0.0 < better < 0.6 * rough
+
+
+points = st.integers(0, 60).flatmap(lambda n: st.tuples(st.just(n), seeds, st.integers(0, 80)))
+
+
+@settings(max_examples=80, deadline=None)
+@given(points)
+def test_the_quadtree_chooses_as_its_twin(case: tuple[int, int, int]) -> None:
+    n, seed, wanted = case
+    rng = np.random.default_rng(seed)
+    width, height = int(rng.integers(12, 90)), int(rng.integers(12, 60))
+    place = rng.choice(width * height, n, replace=False)
+    xy = np.stack([place % width, place // width], axis=1).astype(np.int32) + np.int32(19)
+    response = rng.integers(0, 8, n).astype(np.float32)  # many equal
+    root = (19, 19, 19 + width, 19 + height)
+    chosen = quadtree.choose(xy, response, root, wanted)
+    assert chosen.tolist() == naive.quadtree(xy.tolist(), response.tolist(), root, wanted)
+    assert len(chosen) == min(n, wanted) or n > wanted
+
+
+def test_the_quadtree_spreads_a_bunch_and_keeps_the_lonely() -> None:
+    rng = np.random.default_rng(0)
+    place = rng.choice(1600, 400, replace=False)
+    bunch = np.stack([20 + place % 40, 20 + place // 40], axis=1)
+    lonely = np.array([[500, 40], [40, 400], [600, 450]])
+    xy = np.concatenate([bunch, lonely]).astype(np.int32)
+    response = np.concatenate([np.full(400, 100.0), np.full(3, 1.0)]).astype(np.float32)
+    chosen = quadtree.choose(xy, response, (0, 0, 640, 480), 30)
+    assert {400, 401, 402} <= set(chosen.tolist())
+    assert len(chosen) == 30
+
+
+@settings(max_examples=20, deadline=None)
+@given(seeds, st.integers(4, 40), st.integers(4, 40))
+def test_the_wide_blur_is_opencvs_to_the_bit(seed: int, height: int, width: int) -> None:
+    image = np.random.default_rng(seed).integers(0, 256, (height, width)).astype(np.uint8)
+    np.testing.assert_array_equal(filters.blur_2px(image), cv2.GaussianBlur(image, (7, 7), 2, sigmaY=2, borderType=cv2.BORDER_REFLECT_101))
+
+
+def test_the_narrow_blur_is_the_binomial_rounded() -> None:
+    image = texture(2, 30, 41)
+    weights = np.array([1, 4, 6, 4, 1])
+    exact = cv2.sepFilter2D(image.astype(np.float64), -1, weights, weights, borderType=cv2.BORDER_REFLECT_101)
+    inner = (slice(2, -2), slice(2, -2))
+    np.testing.assert_array_equal(filters.blur_1px(image)[inner], np.floor(exact / 256 + 0.5)[inner])
+
+
+def test_the_disc_is_that_of_opencv() -> None:
+    """The half widths in modules/features2d/src/orb.cpp, by its own loop."""
+    half = [round(np.sqrt(15**2 - v * v)) for v in range(12)] + [0] * 4
+    row = 0
+    for v in range(15, 10, -1):
+        while half[row] == half[row + 1]:
+            row += 1
+        half[v] = row
+        row += 1
+    assert half == [15, 15, 15, 15, 14, 14, 14, 13, 13, 12, 11, 10, 9, 8, 6, 3]
+    np.testing.assert_array_equal(brief._disc(), half)
+
+
+@settings(max_examples=10, deadline=None)
+@given(seeds)
+def test_orientation_and_descriptor_are_those_of_the_twins(seed: int) -> None:
+    image = texture(seed, 60, 70)
+    rng = np.random.default_rng(seed)
+    xy = np.stack([rng.integers(19, 51, 6), rng.integers(19, 41, 6)], axis=1).astype(np.int32)
+    angle = brief.orientation(image, xy)
+    np.testing.assert_allclose(angle, [naive.orientation(image, x, y, brief._disc()) for x, y in xy], atol=1e-6)
+    smooth = filters.blur_2px(image)
+    expected = [naive.brief(smooth, x, y, a, PAIRS) for (x, y), a in zip(xy, angle, strict=True)]
+    np.testing.assert_array_equal(brief.descriptors(smooth, xy, angle), expected)
+
+
+def test_descriptors_and_orientations_are_opencvs_on_every_level() -> None:
+    """OpenCV takes a point's pixel of the full-size image over the level's scale: so the places given to it are level pixels times scale."""
+    grey = texture(21, 240, 320)
+    plain = cv2.ORB_create(500, edgeThreshold=19, patchSize=31)
+    points = []
+    for octave in range(4):
+        for x, y in np.random.default_rng(octave).integers(40, 130, (40, 2)):
+            points.append(cv2.KeyPoint(float(x) * 1.2**octave, float(y) * 1.2**octave, 31.0, 0.0, 1.0, octave))
+    from slamcli.vision import orb
+
+    images = orb.pyramid(grey, levels=8, scale=1.2)
+    ours = []
+    for point in points:
+        xy = np.rint(np.array([point.pt]) / 1.2**point.octave).astype(np.int32)
+        angle = brief.orientation(images[point.octave], xy)
+        point.angle = float(np.rad2deg(angle[0])) % 360
+        ours.append(brief.descriptors(filters.blur_2px(images[point.octave]), xy, angle)[0])
+    kept, theirs = plain.compute(grey, points)
+    assert len(kept) == len(points)
+    order = {(p.pt, p.octave): k for k, p in enumerate(points)}
+    same = [np.unpackbits(~(theirs[k] ^ ours[order[p.pt, p.octave]])).mean() for k, p in enumerate(kept)]
+    assert np.mean(same) >= 0.99
+
+
+def test_the_pattern_is_as_published() -> None:
+    assert PAIRS.shape == (256, 2, 2)
+    assert PAIRS[0].ravel().tolist() == [8, -3, 9, 5]
+    assert PAIRS[-1].ravel().tolist() == [-1, -6, 0, -11]
+    assert np.hypot(*np.moveaxis(PAIRS.astype(float), -1, 0)).max() <= brief.BORDER - 0.5

@@ -1,0 +1,97 @@
+"""Matching kernels against their twin, and what the checks are worth."""
+
+import naive
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from slamcli.vision import hamming
+
+seeds = st.integers(0, 2**32 - 1)
+sizes = st.integers(0, 25)
+
+
+def descriptors(rng: np.random.Generator, n: int) -> np.ndarray:
+    """Few bits set apart, so that distances are often equal."""
+    base = rng.integers(0, 256, (1, 32)).astype(np.uint8)
+    return base ^ np.packbits(rng.random((n, 256)) < 0.05, axis=1).reshape(n, 32)
+
+
+def as_list(found: hamming.Match) -> list[tuple[int, int, int]]:
+    rows, distance = found
+    assert rows.dtype == np.int32 and distance.dtype == np.uint8 and rows.shape == (len(distance), 2)
+    return [(int(i), int(j), int(d)) for (i, j), d in zip(rows, distance, strict=True)]
+
+
+@settings(max_examples=80, deadline=None)
+@given(seeds, sizes, sizes, st.sampled_from([0, 20, 256]), st.sampled_from([0.7, 0.95, 1.0]))
+def test_brute_force_is_its_twin(seed: int, n_i: int, n_j: int, max_distance: int, ratio: float) -> None:
+    rng = np.random.default_rng(seed)
+    a, b = descriptors(rng, n_i), descriptors(rng, n_j)
+    found = hamming.match_brute(a, b, np.zeros(n_i), np.zeros(n_j), max_distance=max_distance, ratio=ratio)
+    expected = naive.matches(a, b, np.ones((n_i, n_j), bool), max_distance, ratio) if n_i and n_j else []
+    assert as_list(found) == expected
+
+
+@settings(max_examples=80, deadline=None)
+@given(seeds, sizes, sizes, st.booleans())
+def test_under_nodes_only_features_with_one_in_common_are_compared(seed: int, n_i: int, n_j: int, has_second: bool) -> None:
+    rng = np.random.default_rng(seed)
+    a, b = descriptors(rng, n_i), descriptors(rng, n_j)
+    node_i, node_j = (rng.integers(0, 4, (n, 2)).astype(np.int32) for n in (n_i, n_j))
+    for node in (node_i, node_j):
+        node[(node[:, 0] == node[:, 1]) | (not has_second), 1] = -1
+    first = node_i[:, :1] == node_j[:, 0]
+    crossed = (node_i[:, 1:] == node_j[:, 0]) | (node_i[:, :1] == node_j[:, 1])
+    found = hamming.match_nodes(a, node_i, b, node_j, np.zeros(n_i), np.zeros(n_j), max_distance=256, ratio=1.0)
+    expected = naive.matches(a, b, first | crossed, 256, hamming.NODE_RATIO) if n_i and n_j else []
+    assert as_list(found) == expected
+
+
+def test_one_column_of_nodes_means_no_second_node() -> None:
+    rng = np.random.default_rng(3)
+    a, b = descriptors(rng, 40), descriptors(rng, 50)
+    node_i, node_j = rng.integers(0, 5, 40), rng.integers(0, 5, 50)
+    one = hamming.match_nodes(a, node_i, b, node_j, np.zeros(40), np.zeros(50))
+    two = hamming.match_nodes(
+        a, np.stack([node_i, 0 * node_i - 1], 1), b, np.stack([node_j, 0 * node_j - 1], 1), np.zeros(40), np.zeros(50)
+    )
+    assert as_list(one) == as_list(two)
+
+
+@settings(max_examples=60, deadline=None)
+@given(seeds, st.integers(1, 60))
+def test_the_turn_check_keeps_the_fullest_bins(seed: int, n: int) -> None:
+    rng = np.random.default_rng(seed)
+    desc = rng.integers(0, 256, (n, 32)).astype(np.uint8)
+    angle_i = (rng.choice([0.0, 0.3, 2.0, 6.0], n) + rng.uniform(-4, 4, n)).astype(np.float32)
+    angle_j = rng.uniform(-4, 4, n).astype(np.float32)
+    rows, _ = hamming.match_brute(desc, desc, angle_i, angle_j, ratio=1.0)
+    every, _ = hamming.match_brute(desc, desc, angle_i, angle_j, ratio=1.0, check_rotation=False)
+    assert len(every) == n
+    is_kept = naive.agreeing([float(angle_i[k]) - float(angle_j[k]) for k in range(n)])
+    assert rows[:, 0].tolist() == np.flatnonzero(is_kept).tolist()
+
+
+def test_one_wrong_turn_among_many_right_ones_goes() -> None:
+    desc = np.random.default_rng(0).integers(0, 256, (40, 32)).astype(np.uint8)
+    turn = np.full(40, 0.2)
+    turn[7] = 2.5
+    rows, _ = hamming.match_brute(desc, desc, turn, np.zeros(40))
+    assert rows[:, 0].tolist() == [k for k in range(40) if k != 7]
+
+
+@pytest.mark.parametrize("n_i, n_j", [(0, 0), (0, 5), (5, 0)])
+def test_nothing_matches_nothing(n_i: int, n_j: int) -> None:
+    desc = np.zeros((5, 32), np.uint8)
+    node = np.zeros((5, 2), np.int32)
+    assert as_list(hamming.match_brute(desc[:n_i], desc[:n_j], np.zeros(n_i), np.zeros(n_j))) == []
+    assert as_list(hamming.match_nodes(desc[:n_i], node[:n_i], desc[:n_j], node[:n_j], np.zeros(n_i), np.zeros(n_j))) == []
+
+
+def test_columns_of_different_length_are_refused() -> None:
+    desc, node, angle = np.zeros((5, 32), np.uint8), np.zeros((5, 2), np.int32), np.zeros(5)
+    for columns in ((node[:4], node, angle, angle), (node, node[:4], angle[:4], angle), (node, np.zeros((6, 2)), angle, angle)):
+        with pytest.raises(ValueError, match="differ in number"):
+            hamming.match_nodes(desc, columns[0], desc, columns[1], columns[2], columns[3])

@@ -1,0 +1,129 @@
+"""The rules of import, and of what a compiled kernel may call. Read from the source text: nothing is imported for it."""
+
+import ast
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import slamcli
+
+PACKAGE = Path(slamcli.__file__).parent
+MODULES = sorted(PACKAGE.rglob("*.py"))
+
+# What each layer may import of slamcli beside itself; "errors" is open to all.
+BASE = {"errors", "schema", "config", "artifacts", "parallel", "open3d_loader"}
+MAY_IMPORT = {
+    "errors": set(),
+    "geometry": set(),
+    "vision": {"geometry", "schema", "config", "parallel", "data"},
+    "mapping": {"geometry", "vision", "schema", "config", "artifacts", "parallel", "open3d_loader"},
+    "formats": {"geometry", "schema"},
+    "datasets": {"geometry", "schema", "formats", "parallel", "open3d_loader", "console"},
+    "stages": BASE | {"geometry", "vision", "mapping", "formats", "datasets"},
+    "pipeline": BASE | {"geometry", "datasets", "stages", "freshness", "rundir", "config_io", "console", "meter", "files"},
+    "rundir": BASE | {"geometry", "datasets", "stages", "freshness", "config_io", "files"},
+    "files": set(),
+    "freshness": {"config", "schema", "stages"},
+    "config_io": {"config", "geometry"},
+}
+CLICK = ("cli",)
+OPEN3D = ("datasets/simulate", "datasets/scene", "mapping/fusion.py", "render", "open3d_loader.py", "view.py")
+EVO = ("evaluate.py", "report.py", "plots.py")
+
+
+def name_of(path: Path) -> str:
+    return path.relative_to(PACKAGE).as_posix()
+
+
+def layer_of(path: Path) -> str:
+    return name_of(path).split("/")[0].removesuffix(".py")
+
+
+def imports(tree: ast.AST) -> Iterator[tuple[str, bool]]:
+    """Give each imported module's dotted name, and whether the import is at the top; what only type checkers see is left out."""
+    for node in ast.iter_child_nodes(tree):
+        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
+            continue
+        if isinstance(node, ast.Import):
+            yield from ((alias.name, isinstance(tree, ast.Module)) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, "imports are absolute"
+            for alias in node.names:
+                yield (f"{node.module}.{alias.name}" if node.module == "slamcli" else str(node.module)), isinstance(tree, ast.Module)
+        else:
+            yield from ((name, False) for name, _ in imports(node))
+
+
+def parsed(path: Path) -> ast.Module:
+    return ast.parse(path.read_text(encoding="utf-8"))
+
+
+@pytest.mark.parametrize("path", [path for path in MODULES if layer_of(path) in MAY_IMPORT], ids=name_of)
+def test_each_module_imports_only_layers_below_it(path: Path) -> None:
+    layer = layer_of(path)
+    used = {name.split(".")[1] for name, _ in imports(parsed(path)) if name.startswith("slamcli.")}
+    used -= {"errors", layer, "__version__", "user_cache"}
+    assert used <= MAY_IMPORT[layer], f"{name_of(path)} must not import {sorted(used - MAY_IMPORT[layer])}"
+
+
+@pytest.mark.parametrize("path", MODULES, ids=name_of)
+def test_heavy_and_interactive_packages_stay_where_they_belong(path: Path) -> None:
+    for name, is_at_top in imports(parsed(path)):
+        package, here = name.split(".")[0], name_of(path)
+        if package == "click":
+            assert here.startswith(CLICK)
+        if package == "open3d":
+            assert here.startswith(OPEN3D), f"{here} imports open3d"
+            assert not is_at_top, f"{here} imports open3d at its top"
+        if package == "evo":
+            assert here.startswith(EVO), f"{here} imports evo"
+            assert not is_at_top, f"{here} imports evo at its top"
+        if here.startswith("cli/") and is_at_top:
+            assert package in {*sys.stdlib_module_names, "click", "slamcli", "__future__"}, f"{here} imports {package} at its top"
+
+
+def is_kernel(function: ast.FunctionDef) -> bool:
+    return any("njit" in ast.unparse(decorator) for decorator in function.decorator_list)
+
+
+@pytest.mark.parametrize("path", MODULES, ids=name_of)
+def test_a_kernel_calls_only_kernels_of_its_own_file_or_of_geometry(path: Path) -> None:
+    """Numba's cache does not notice a change in another file's helper; those of geometry/ are covered by the cache's name."""
+    tree = parsed(path)
+    foreign = {
+        alias.asname or alias.name: str(node.module)
+        for node in ast.walk(tree)
+        if isinstance(node, ast.ImportFrom) and str(node.module).startswith("slamcli")
+        for alias in node.names
+        if not f"{node.module}.{alias.name}".startswith("slamcli.geometry.") or layer_of(path) == "geometry"
+    }
+    if layer_of(path) == "geometry":
+        foreign = {}
+    plain = {node.name for node in tree.body if isinstance(node, ast.FunctionDef) and not is_kernel(node)}
+    for function in (node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef) and is_kernel(node)):
+        for call in (node for node in ast.walk(function) if isinstance(node, ast.Call)):
+            called = ast.unparse(call.func).split(".")[0]
+            assert called not in foreign, f"{name_of(path)}: {function.name} calls {called} of {foreign.get(called)}"
+            assert called not in plain, f"{name_of(path)}: {function.name} calls {called}, which is not compiled"
+
+
+@pytest.mark.parametrize("path", MODULES, ids=name_of)
+def test_kernels_keep_to_the_options_that_are_sound(path: Path) -> None:
+    """NaN means "no depth", so arithmetic may not assume it away; numba's own threads do not mix with ours; every kernel is cached."""
+    for function in (node for node in ast.walk(parsed(path)) if isinstance(node, ast.FunctionDef) and is_kernel(node)):
+        options = "".join(ast.unparse(decorator) for decorator in function.decorator_list)
+        is_helper = function.name.startswith("_")  # becomes part of the kernels that call it
+        assert is_helper or "cache=True" in options, f"{name_of(path)}: {function.name}"
+        assert "fastmath=True" not in options, f"{name_of(path)}: {function.name}"
+        assert "parallel=True" not in options, f"{name_of(path)}: {function.name}"
+
+
+def test_help_is_instant_since_it_imports_nothing_heavy() -> None:
+    code = "import sys; from slamcli.cli.main import cli; cli(['--help'], standalone_mode=False); print(*sys.modules, file=sys.stderr)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
+    loaded = set(done.stderr.split())
+    assert "Commands:" in done.stdout
+    assert not loaded & {"numpy", "scipy", "numba", "cv2", "open3d", "evo", "matplotlib", "tqdm", "pandas"}

@@ -1,0 +1,33 @@
+import numpy as np
+
+from slamcli.geometry import se3
+from slamcli.mapping.timing import depth_poses
+
+RATE = np.array([0.3, -0.2, 0.1, 0.2, 0.4, -0.1])  # twist a second
+
+
+def moving(stamp: np.ndarray) -> np.ndarray:
+    return se3.exp(np.multiply.outer(stamp, RATE))
+
+
+def test_a_steady_motion_is_followed_to_the_depth_images_time() -> None:
+    stamp = np.arange(10) / 30.0
+    depth_stamp = stamp + np.array([0.01, -0.01, 0.0, 0.016, -0.016, 0.004, -0.004, 0.01, -0.01, -0.01])
+    np.testing.assert_allclose(depth_poses(stamp, depth_stamp, moving(stamp)), moving(depth_stamp), atol=1e-9)
+
+
+def test_poses_stay_where_there_is_no_depth_no_neighbour_or_a_long_gap() -> None:
+    stamp = np.array([0.0, 0.03, 0.06, 1.0, 1.03, 1.06])
+    depth_stamp = np.array([-0.01, np.nan, 0.07, 0.99, 1.04, 1.07])
+    T_wc = moving(stamp)
+    T_wc[5] = np.nan
+    out = depth_poses(stamp, depth_stamp, T_wc)
+    np.testing.assert_array_equal(out, T_wc)  # before the first, none, across the gap (twice), towards a lost frame, lost
+
+
+def test_the_poses_given_are_not_changed() -> None:
+    stamp = np.array([0.0, 0.03])
+    T_wc = moving(stamp)
+    before = T_wc.copy()
+    assert not np.array_equal(depth_poses(stamp, stamp + 0.01, T_wc), before)
+    np.testing.assert_array_equal(T_wc, before)
