@@ -9,7 +9,7 @@ RECORDING as for `slamcli run`, with a true trajectory: tum/fr1_xyz, a folder, d
 import argparse
 import time
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import asdict
+from functools import partial
 
 import cv2
 import numpy as np
@@ -20,6 +20,7 @@ from slamcli import config_io
 from slamcli.config import Config, MatchConfig
 from slamcli.errors import SlamError
 from slamcli.parallel import ordered_map
+from slamcli.stages.extract import detect as detect_under
 from slamcli.vision import hamming, orb, vocabulary
 from slamcli.vision.comparison import evenness, plain_orb
 
@@ -27,26 +28,20 @@ RADIUS = 3.0  # [px] within which a point is found again, or a match is correct
 CHANCE = (8.0, 16.0)  # [px] by which points are moved to tell how often one is hit by chance
 REVISIT_AFTER = 5.0  # [s] a place seen again sooner is not a loop
 KEY_FRAME_SHARED, SAME_PLACE, OTHER_PLACE = 0.8, 0.5, 0.1  # shared view: less makes a key frame; more is the same place; less is another
-ROUNDS = 5  # the fastest counts: other processes only ever add time
+ROUNDS = 7  # the fastest counts: other processes only ever add time
 
 Detector = Callable[[np.ndarray], orb.KeyPoints]
 
 
-def detector(settings: Config) -> Detector:
-    """Give our detector under these settings."""
-    options = asdict(settings.extract)
-    names = {"fast_threshold": "threshold", "fast_threshold_low": "threshold_low"}
-    return lambda grey: orb.detect(grey, **{names.get(name, name): value for name, value in options.items()})
-
-
-def cpu_ms(work: Callable[[], object], n: int) -> float:
-    """Give the CPU time of `work` on n items, of all threads, per item [ms]."""
-    best = np.inf
+def cpu_ms(works: dict[str, Callable[[], object]], n: int) -> dict[str, float]:
+    """Give the CPU time of each work on n items, of all threads, per item [ms]. They take turns, so that all meet the same machine."""
+    best = dict.fromkeys(works, np.inf)
     for _ in range(ROUNDS):
-        start = time.process_time()
-        work()
-        best = min(best, time.process_time() - start)
-    return best / n * 1e3
+        for name, work in works.items():
+            start = time.process_time()
+            work()
+            best[name] = min(best[name], time.process_time() - start)
+    return {name: seconds / n * 1e3 for name, seconds in best.items()}
 
 
 def rate(detect: Detector, images: list[np.ndarray], workers: int) -> float:
@@ -88,19 +83,31 @@ def found_again(recording: Recording, detect: Detector, pairs: list[tuple[int, i
     return {"found again": any_, "by chance": chance, "beyond chance": (any_ - chance) / (1 - chance), "one to one": mutual}
 
 
-def matched(recording: Recording, detect: Detector, pairs: list[tuple[int, int]], match: Callable) -> dict[str, float]:
-    """Average the matches whose truth is known, the correct ones, and the median error of those [px]; and time the matching."""
+def matched(
+    recording: Recording, detect: Detector, pairs: list[tuple[int, int]], methods: dict[str, Callable]
+) -> dict[str, dict[str, float]]:
+    """For each method average the matches that are correct, their share of those whose truth is known, their median error; and the time."""
     frames = {k: detect(recording.grey(k)) for pair in pairs for k in pair}
-    known, correct, errors = 0, 0, []
+    known, correct = dict.fromkeys(methods, 0), dict.fromkeys(methods, 0)
+    errors = {name: [] for name in methods}
     for i, j in pairs:
-        rows, _ = match(frames[i], frames[j])
-        true = recording.carry(frames[i].xy.astype(np.float64), i, j)[rows[:, 0]]
-        error = np.linalg.norm(true - recording.camera.undistort(frames[j].xy)[rows[:, 1]], axis=1)
-        known += np.isfinite(error).sum()
-        correct += (error < RADIUS).sum()
-        errors.append(error[error < RADIUS])
-    ms = cpu_ms(lambda: [match(frames[i], frames[j]) for i, j in pairs], len(pairs))
-    return {"correct": correct / len(pairs), "precision": correct / max(known, 1), "median px": np.median(np.concatenate(errors)), "ms": ms}
+        true, there = recording.carry(frames[i].xy.astype(np.float64), i, j), recording.camera.undistort(frames[j].xy)
+        for name, match in methods.items():
+            rows, _ = match(frames[i], frames[j])
+            error = np.linalg.norm(true[rows[:, 0]] - there[rows[:, 1]], axis=1)
+            known[name] += np.isfinite(error).sum()
+            correct[name] += (error < RADIUS).sum()
+            errors[name].append(error[error < RADIUS])
+    ms = cpu_ms({name: (lambda m=match: [m(frames[i], frames[j]) for i, j in pairs]) for name, match in methods.items()}, len(pairs))
+    return {
+        name: {
+            "correct": correct[name] / len(pairs),
+            "precision": correct[name] / max(known[name], 1),
+            "median px": np.median(np.concatenate(errors[name])),
+            "ms": ms[name],
+        }
+        for name in methods
+    }
 
 
 def brute(a: orb.KeyPoints, b: orb.KeyPoints) -> tuple[np.ndarray, np.ndarray]:
@@ -175,7 +182,7 @@ def table(title: str, rows: Iterable[tuple[str, dict[str, float]]]) -> Iterator[
 
 def report(recording: Recording, settings: Config, n_pairs: int) -> Iterator[str]:
     """Measure everything on one recording."""
-    detectors = {"OpenCV ORB": plain_orb, "slamcli": detector(settings)}
+    detectors = {"OpenCV ORB": plain_orb, "slamcli": partial(detect_under, settings=settings.extract)}
     ours = detectors["slamcli"]
     near, far = recording.pairs(apart=1, wanted=n_pairs), recording.pairs(apart=10, wanted=n_pairs)
     images = [recording.grey(i) for i, _ in far]
@@ -184,19 +191,17 @@ def report(recording: Recording, settings: Config, n_pairs: int) -> Iterator[str
     yield from table(
         f"repeatability, 10 frames apart, {RADIUS:g} px", ((name, found_again(recording, d, far)) for name, d in detectors.items())
     )
-    yield from table("brute-force matches, 10 frames apart", ((name, matched(recording, d, far, brute)) for name, d in detectors.items()))
-    bare = orb_bare()
-    times = {"OpenCV ORB": bare, "slamcli": ours}
     yield from table(
-        "CPU time", ((name, {"ms a frame": cpu_ms(lambda d=d: [d(g) for g in images], len(images))}) for name, d in times.items())
+        "brute-force matches, 10 frames apart", ((name, matched(recording, d, far, {"": brute})[""]) for name, d in detectors.items())
     )
+    works = {name: (lambda d=d: [d(grey) for grey in images]) for name, d in {"OpenCV ORB": orb_bare(), "slamcli": ours}.items()}
+    yield from table("CPU time", ((name, {"ms a frame": ms}) for name, ms in cpu_ms(works, len(images)).items()))
     one, two = rate(ours, images, 1), rate(ours, images, 2)
     yield from table("threads", [("slamcli", {"frames/s with 1": one, "with 2": two, "factor": two / one})])
     words = vocabulary.load(settings.match.vocabulary)
     by_node = ByNode(words, settings.match)
     for apart, pairs in ((1, near), (10, far)):
-        methods = (("brute", brute), ("words", by_node))
-        yield from table(f"matching, {apart} apart", ((name, matched(recording, ours, pairs, m)) for name, m in methods))
+        yield from table(f"matching, {apart} apart", matched(recording, ours, pairs, {"brute": brute, "words": by_node}).items())
     yield from table(f"places seen again, {words.n_words} words", [("slamcli", recall(recording, ours, words))])
 
 

@@ -92,6 +92,11 @@ def test_nothing_matches_nothing(n_i: int, n_j: int) -> None:
 
 def test_columns_of_different_length_are_refused() -> None:
     desc, node, angle = np.zeros((5, 32), np.uint8), np.zeros((5, 2), np.int32), np.zeros(5)
-    for columns in ((node[:4], node, angle, angle), (node, node[:4], angle[:4], angle), (node, np.zeros((6, 2)), angle, angle)):
-        with pytest.raises(ValueError, match="differ in number"):
+    for columns in (
+        (node[:4], node, angle, angle),
+        (node, node[:4], angle[:4], angle),
+        (node, np.zeros((6, 2)), angle, angle),
+        (node - 1, node, angle, angle),
+    ):
+        with pytest.raises(ValueError, match="each descriptor needs"):
             hamming.match_nodes(desc, columns[0], desc, columns[1], columns[2], columns[3])

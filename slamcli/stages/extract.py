@@ -61,7 +61,20 @@ def _extract(dataset: Dataset, settings: ExtractConfig, i: int) -> _Frame:
         grey = dataset.grey(i)
     except BadFrame as error:
         return _Frame(orb.no_key_points(), np.zeros(0, np.float32), has_depth=False, faults=[str(error)])
-    points = orb.detect(
+    points = detect(grey, settings)
+    try:
+        depth = dataset.depth(i)
+    except BadFrame as error:
+        depth = None
+        faults.append(str(error))
+    if depth is None:
+        return _Frame(points, np.full(len(points), np.nan, np.float32), has_depth=False, faults=faults)
+    return _Frame(points, depth_at(depth, points.xy, window=settings.depth_window), has_depth=True, faults=faults)
+
+
+def detect(grey: np.ndarray, settings: ExtractConfig) -> orb.KeyPoints:
+    """Find the key points of a grey image (H, W) uint8 under these settings."""
+    return orb.detect(
         grey,
         features=settings.features,
         levels=settings.levels,
@@ -74,14 +87,6 @@ def _extract(dataset: Dataset, settings: ExtractConfig, i: int) -> _Frame:
         rank_by=settings.rank_by,
         subpixel=settings.subpixel,
     )
-    try:
-        depth = dataset.depth(i)
-    except BadFrame as error:
-        depth = None
-        faults.append(str(error))
-    if depth is None:
-        return _Frame(points, np.full(len(points), np.nan, np.float32), has_depth=False, faults=faults)
-    return _Frame(points, depth_at(depth, points.xy, window=settings.depth_window), has_depth=True, faults=faults)
 
 
 def depth_at(depth: np.ndarray, xy: np.ndarray, *, window: int = 1) -> np.ndarray:

@@ -1,13 +1,14 @@
 """Matching of binary descriptors by Hamming distance: all with all, or only those under one vocabulary node."""
 
 import numpy as np
-from numba import int32, njit
+from numba import njit, uint32
 
 from slamcli.geometry.bits import popcount
 
 BINS = 30  # of the histogram of turns between matched points
 KEPT_BINS = 3
 FAR = 257  # [bits] more than two descriptors can differ by
+INDEX_BITS = 22  # of a number that holds a distance above an index
 NODE_RATIO = (
     0.975  # among the few under a node the second nearest is farther than among all; this makes up for it: precision as of brute force
 )
@@ -16,55 +17,68 @@ Match = tuple[np.ndarray, np.ndarray]
 
 
 @njit(cache=True, nogil=True)
-def _compare(desc_i, block, desc_j, row_of_entry, best, following, choice, best_j, choice_j):
-    """Keep for each row of i the smallest distance, whose it is, and the next smallest; and for each row of j the smallest. Ties: the first.
+def _compare(desc_i, block, desc_j, row_of_entry, back, best, following, choice):
+    """Keep for each row of i the smallest distance, whose it is, and the next smallest of another row; and for each entry of j the smallest.
 
     desc_i : (N, 4) uint64; block : (N, B, 2) int32, start and stop of the entries each row of i is compared with
     desc_j : (4, E) uint64, entries, those of a node side by side; row_of_entry : (E,) int32, a row of j may have several
+    back : (E,) uint32, smallest distance << INDEX_BITS | row of i; best, following, choice : (N,) int32
 
-    First all distances of a block, then their minima: the first loop has no branch, so several descriptors go in one instruction.
+    A distance and an index in one number have their minimum at the smallest distance, of equals the first; so no loop has a branch, and several
+    descriptors go in one instruction.
     """
     b0, b1, b2, b3 = desc_j[0], desc_j[1], desc_j[2], desc_j[3]
-    distance = np.empty(len(row_of_entry), dtype=np.int32)
+    distance = np.empty(len(row_of_entry), dtype=np.uint32)
+    shift = uint32(INDEX_BITS)
     for i in range(len(desc_i)):
         a0, a1, a2, a3 = desc_i[i, 0], desc_i[i, 1], desc_i[i, 2], desc_i[i, 3]
-        least, second, nearest = int32(FAR), int32(FAR), int32(-1)
+        least = uint32(0xFFFFFFFF)
         for b in range(block.shape[1]):
             start, stop = block[i, b, 0], block[i, b, 1]
             if start == stop:
                 continue
-            c0, c1, c2, c3 = b0[start:stop], b1[start:stop], b2[start:stop], b3[start:stop]
+            c0, c1, c2, c3, d, k = b0[start:stop], b1[start:stop], b2[start:stop], b3[start:stop], distance[start:stop], back[start:stop]
             for e in range(stop - start):
-                distance[e] = int32(popcount(a0 ^ c0[e]) + popcount(a1 ^ c1[e]) + popcount(a2 ^ c2[e]) + popcount(a3 ^ c3[e]))
-            rows = row_of_entry[start:stop]
+                bits = uint32(popcount(a0 ^ c0[e]) + popcount(a1 ^ c1[e]) + popcount(a2 ^ c2[e]) + popcount(a3 ^ c3[e]))
+                d[e] = bits
+                k[e] = min(k[e], uint32(uint32(bits << shift) | uint32(i)))
+                least = min(least, uint32(uint32(bits << shift) | uint32(start + e)))
+        if least == uint32(0xFFFFFFFF):
+            best[i], following[i], choice[i] = FAR, FAR, -1
+            continue
+        nearest, second = row_of_entry[least & uint32((1 << INDEX_BITS) - 1)], uint32(FAR)
+        for b in range(block.shape[1]):
+            start, stop = block[i, b, 0], block[i, b, 1]
+            d, rows = distance[start:stop], row_of_entry[start:stop]
             for e in range(stop - start):
-                d, j = distance[e], rows[e]
-                if d < best_j[j]:
-                    best_j[j], choice_j[j] = d, i
-                if d < second and j != nearest:
-                    if d < least:
-                        least, second, nearest = d, least, j
-                    else:
-                        second = d
-        best[i], following[i], choice[i] = least, second, nearest
+                second = min(second, d[e] if rows[e] != nearest else uint32(FAR))
+        best[i], following[i], choice[i] = least >> shift, second, nearest
 
 
 @njit(cache=True, nogil=True)
-def _accept(best, following, choice, choice_j, max_distance, ratio, rows):
-    """List the matches that pass distance and ratio and are each other's nearest; rows : (N, 2) int32. Returns their number."""
+def _accept(best, following, choice, back, row_of_entry, back_of_row, max_distance, ratio, rows):
+    """List the matches that pass distance and ratio and are each other's nearest.
+
+    back_of_row : (M,) uint32 of the largest number, becomes `back` of the rows of j; rows : (N, 2) int32. Returns the number of matches.
+    """
+    for e in range(len(back)):
+        j = row_of_entry[e]
+        back_of_row[j] = min(back_of_row[j], back[e])
     n = 0
     for i in range(len(best)):
-        if best[i] <= max_distance and best[i] < ratio * following[i] and choice_j[choice[i]] == i:
+        is_near = best[i] <= max_distance and best[i] < ratio * following[i]
+        if is_near and back_of_row[choice[i]] & uint32((1 << INDEX_BITS) - 1) == i:
             rows[n, 0], rows[n, 1] = i, choice[i]
             n += 1
     return n
 
 
 @njit(cache=True, nogil=True)
-def _group(node_i, node_j, start, block, row_of_entry):
+def _group(node_i, node_j, desc_j, start, block, row_of_entry, entries):
     """Sort the rows of j by node, those whose first node it is before those whose second it is, and find each row of i its blocks.
 
-    start : (2 n_nodes + 1,) int32 of zeros. A counting sort; returns the number of entries.
+    desc_j : (M, 4) uint64; start : (2 n_nodes + 1,) int32 of zeros; entries : (4, E) uint64, descriptors in the new order
+    A counting sort; returns the number of entries.
     """
     for j in range(len(node_j)):
         for c in range(node_j.shape[1]):
@@ -77,7 +91,9 @@ def _group(node_i, node_j, start, block, row_of_entry):
         for c in range(node_j.shape[1]):
             if node_j[j, c] >= 0:
                 k = 2 * node_j[j, c] + c
-                row_of_entry[place[k]] = j
+                e = place[k]
+                row_of_entry[e] = j
+                entries[0, e], entries[1, e], entries[2, e], entries[3, e] = desc_j[j, 0], desc_j[j, 1], desc_j[j, 2], desc_j[j, 3]
                 place[k] += 1
     for i in range(len(node_i)):
         first = 2 * node_i[i, 0]
@@ -106,8 +122,8 @@ def match_brute(
     """
     block = np.empty((len(desc_i), 1, 2), dtype=np.int32)
     block[:] = 0, len(desc_j)
-    row_of_entry = np.arange(len(desc_j), dtype=np.int32)
-    return _match(desc_i, block, desc_j, row_of_entry, angle_i, angle_j, max_distance, ratio, check_rotation)
+    row_of_entry, entries = np.arange(len(desc_j), dtype=np.int32), np.ascontiguousarray(as_words(desc_j).T)
+    return _match(desc_i, block, entries, row_of_entry, angle_i, angle_j, max_distance, ratio, check_rotation)
 
 
 def match_nodes(
@@ -122,11 +138,13 @@ def match_nodes(
     node_i, node_j = (
         np.ascontiguousarray(node, dtype=np.int32).reshape(len(node), 1 if np.ndim(node) == 1 else 2) for node in (node_i, node_j)
     )
+    if (len(node_i), len(node_j)) != (len(desc_i), len(desc_j)) or min(node_i[:, 0].min(initial=0), node_j[:, 0].min(initial=0)) < 0:
+        raise ValueError("each descriptor needs a node")
     n_nodes = 1 + max(int(node_i.max(initial=0)), int(node_j.max(initial=0)))
     block = np.zeros((len(node_i), node_i.shape[1], 2), dtype=np.int32)
-    row_of_entry = np.empty(node_j.size, dtype=np.int32)
-    row_of_entry = row_of_entry[: _group(node_i, node_j, np.zeros(2 * n_nodes + 1, dtype=np.int32), block, row_of_entry)]
-    return _match(desc_i, block, desc_j, row_of_entry, angle_i, angle_j, max_distance, ratio * NODE_RATIO, check_rotation)
+    row_of_entry, entries = np.empty(node_j.size, dtype=np.int32), np.empty((4, node_j.size), dtype=np.uint64)
+    n = _group(node_i, node_j, as_words(desc_j), np.zeros(2 * n_nodes + 1, dtype=np.int32), block, row_of_entry, entries)
+    return _match(desc_i, block, entries, row_of_entry[:n], angle_i, angle_j, max_distance, ratio * NODE_RATIO, check_rotation)
 
 
 @njit(cache=True, nogil=True)
@@ -159,17 +177,17 @@ def _keep_agreeing(rows, angle_i, angle_j):
     return n
 
 
-def _match(desc_i, block, desc_j, row_of_entry, angle_i, angle_j, max_distance, ratio, check_rotation) -> Match:
-    words_i, words_j = as_words(desc_i), as_words(desc_j)
-    n_i, n_j = len(words_i), len(words_j)
-    if (len(block), len(angle_i), len(angle_j)) != (n_i, n_i, n_j) or row_of_entry.max(initial=-1) >= n_j:
-        raise ValueError("descriptors, nodes and angles of a frame differ in number")
+def _match(desc_i, block, entries, row_of_entry, angle_i, angle_j, max_distance, ratio, check_rotation) -> Match:
+    words_i, n_i, n_j = as_words(desc_i), len(angle_i), len(angle_j)
+    if len(words_i) != n_i or row_of_entry.max(initial=-1) >= n_j:
+        raise ValueError("each descriptor needs an angle")
+    if max(n_i, len(row_of_entry)) >> INDEX_BITS:
+        raise ValueError(f"more than {1 << INDEX_BITS} descriptors in a frame")
     best, following, choice = (np.empty(n_i, dtype=np.int32) for _ in range(3))
-    best_j, choice_j = np.full(n_j, FAR, dtype=np.int32), np.full(n_j, -1, dtype=np.int32)
-    entries = np.ascontiguousarray(words_j[row_of_entry].T)
-    _compare(words_i, block, entries, row_of_entry, best, following, choice, best_j, choice_j)
+    back, back_of_row = (np.full(n, 0xFFFFFFFF, dtype=np.uint32) for n in (len(row_of_entry), n_j))
+    _compare(words_i, block, entries, row_of_entry, back, best, following, choice)
     rows = np.empty((n_i, 2), dtype=np.int32)
-    rows = rows[: _accept(best, following, choice, choice_j, min(int(max_distance), FAR - 1), float(ratio), rows)]
+    rows = rows[: _accept(best, following, choice, back, row_of_entry, back_of_row, min(int(max_distance), FAR - 1), float(ratio), rows)]
     if check_rotation:
         rows = rows[
             : _keep_agreeing(rows, np.ascontiguousarray(angle_i, dtype=np.float32), np.ascontiguousarray(angle_j, dtype=np.float32))
