@@ -12,7 +12,7 @@ from slamcli.formats.cloud import write_ply
 from slamcli.formats.trajectory import write_tum
 from slamcli.geometry import se3
 from slamcli.rundir import RunDir, outputs
-from slamcli.schema import FORMAT, Closures, Features, Ground, Map, Tracks, Trajectory, trajectory
+from slamcli.schema import FORMAT, Closures, Features, Ground, Map, Timing, Tracks, Trajectory, trajectory
 from slamcli.stages import STAGES
 
 START = 1305031102.0  # [s]
@@ -110,11 +110,12 @@ def _results(rng: np.random.Generator, truth: Trajectory, lost: np.ndarray) -> d
     )  # fmt: skip
     track, loop = (_tracks(found[name].T_wc, kf_frame, lost) for name in ("track", "loop"))
     maps = {name: _map(T_wc[kf_frame], kf_frame) for name, T_wc in (("track", found["track"].T_wc), ("loop", found["loop"].T_wc))}
+    when = Timing(readout=np.array(0.0), depth_delay=np.array(0.0), twist=np.zeros((frames, 6)))
     return {
         "extract": (features,),
         "track": (track, maps["track"]),
-        "optimize": (track, maps["track"]),
-        "loop": (loop, closures, maps["loop"]),
+        "optimize": (track, when, maps["track"]),
+        "loop": (loop, closures, when, maps["loop"]),
         "densify": (ground,),
     }
 

@@ -14,7 +14,7 @@ from slamcli.errors import BadFrame
 from slamcli.formats import grid_map, octomap
 from slamcli.geometry import se3
 from slamcli.rundir import RunDir
-from slamcli.schema import Features, Grid, Ground, Map, Tracks
+from slamcli.schema import Features, Grid, Ground, Map, Timing, Tracks
 from slamcli.stages import grid2d, stage_named
 
 
@@ -167,6 +167,7 @@ class Inputs:
                 np.array(1.2),
             ),
             Ground: Ground(T_lw, plane, np.array(0.01), np.array(0.9), np.array(is_found)),
+            Timing: Timing(np.array(0.0), np.array(0.0), np.zeros((n, 6))),
             Tracks: Tracks(np.where(lost, -1, np.arange(n)).astype(np.int32), T_kc, np.ones(n, np.uint8), np.full(n, 99, np.int32)),
             Map: Map(
                 np.arange(n, dtype=np.int32), T_wl @ T_lc, np.empty((0, 3)), *(np.empty(0, t) for t in (np.int32, np.int32, np.int64))

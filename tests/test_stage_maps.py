@@ -17,7 +17,7 @@ from slamcli.datasets.simulate import Simulation, build, simulate
 from slamcli.formats import cloud, octomap
 from slamcli.geometry import se3
 from slamcli.mapping import occupancy
-from slamcli.schema import Features, Ground, Map, Tracks
+from slamcli.schema import Features, Ground, Map, Timing, Tracks
 from slamcli.stages import densify, octree
 
 SETTINGS = {"seed": 1, "frames": 220, "laps": 2.0, "width": 160, "height": 120, "movable": True}
@@ -46,7 +46,13 @@ class Inputs:
         T_kc = se3.inverse(T_wc[kf])[ref_kf] @ T_wc
         T_kc[frames.stop if frames.stop else n :] = np.nan  # not tracked
         self._records[Tracks] = Tracks(ref_kf, T_kc, none, none)
+        self._records[Timing] = Timing(np.array(0.0), np.array(0.0), np.zeros((n, 6)))
         self.runs = runs
+
+    def delay_depth(self, seconds: float) -> None:
+        """Let the stamps of the depth images be early by this much, and optimize have found it out."""
+        self._records[Features].depth_stamp = self._records[Features].depth_stamp - seconds
+        self._records[Timing] = replace(self._records[Timing], depth_delay=np.array(seconds))
 
     def camera(self):
         return self.dataset.camera
@@ -156,11 +162,22 @@ def test_the_floor_is_level_and_at_zero(done: Done) -> None:
 def test_the_octree_agrees_with_the_images_it_was_made_from(done: Done) -> None:
     tree = octomap.read(done.folder / "octree" / "map.ot")
     T_lw = artifacts.load(Ground, done.folder / "densify").T_lw
-    poses = [(frame, T_lw @ T_wk) for frame, T_wk in densify.keyframe_depth_poses(done.inputs)]
+    poses = [(frame, T_lw @ T_wk) for frame, T_wk in densify.depth_poses(done.inputs)]
     scans = octree.scans(done.inputs.dataset, done.inputs.camera(), poses, CFG.sensor, CFG.octree)
     result = occupancy.accuracy(tree, scans, max_range=CFG.octree.max_range)
     assert 0.97 < result.share < 1.0
     assert result.unknown == 0
+
+
+def test_the_depth_delay_that_optimize_found_is_taken_out_of_the_poses(recording: Path, tmp_path: Path) -> None:
+    on_time, delayed = Inputs(recording, tmp_path), Inputs(recording, tmp_path)
+    delayed.delay_depth(0.02)
+    for (frame, T_wd), (same_frame, T_wd_delayed) in zip(densify.depth_poses(on_time), densify.depth_poses(delayed), strict=True):
+        assert frame == same_frame
+        np.testing.assert_allclose(T_wd_delayed, T_wd, atol=1e-12)
+    delayed._records[Timing] = on_time._records[Timing]
+    moved = [np.abs(a - b).max() for (_, a), (_, b) in zip(densify.depth_poses(on_time), densify.depth_poses(delayed), strict=True)]
+    assert np.median(moved) > 1e-4
 
 
 def test_an_object_that_is_taken_away_fades_from_the_octree(recording: Path, tmp_path: Path) -> None:

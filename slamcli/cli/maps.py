@@ -88,7 +88,7 @@ def export_mesh(out: Path, run: str | None, voxel: float) -> None:
     folder = RunDir.find(run)
     config, camera, T_lw = folder.config(), folder.camera(), folder.load(Ground, "densify").T_lw
     option = replace(config.densify, method="tsdf", voxel=voxel)
-    poses = console.progress(densify.keyframe_depth_poses(folder), "mesh")
+    poses = console.progress(densify.depth_poses(folder), "mesh")
     volume = Volume(camera, voxel=voxel, depth_max=option.depth_max)
     for view in densify.views(folder.dataset(), camera, poses, config.sensor, option, workers=config.run.workers):
         volume.add(view.seen, view.rgb, view.T_wk)

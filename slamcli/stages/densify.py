@@ -14,7 +14,7 @@ from slamcli.formats.cloud import write_ply, write_ply_mesh
 from slamcli.geometry.camera import Camera
 from slamcli.mapping import fusion, ground, timing
 from slamcli.parallel import ordered_map
-from slamcli.schema import Features, Map, Tracks, frame_poses
+from slamcli.schema import Features, Map, Timing, Tracks, frame_poses
 
 SAMPLES_APART = 0.75  # voxels from sample to sample of a near surface: denser ones gain nothing
 GROUND_FRAMES = 40  # key frames, evenly spread, that are searched for the floor; more do not move it
@@ -23,7 +23,7 @@ GROUND_FRAMES = 40  # key frames, evenly spread, that are searched for the floor
 def run(inputs: Any, out: Path, cfg: Any, tools: Any) -> dict:
     """Find the floor, join the key frames' depth, write `cloud.ply` (and `mesh.ply` where a surface was made) in the floor's frame."""
     camera, option = inputs.camera(), cfg.densify
-    poses = keyframe_depth_poses(inputs)
+    poses = depth_poses(inputs)
     model_w = _model(camera, option)
     n_used = 0
 
@@ -74,17 +74,12 @@ def depth_poses(inputs: Any, *, frames: str = "key") -> list[tuple[int, np.ndarr
     inputs : what a stage gets, or a RunDir
     frames : "key" frames, or "all" that have a pose
     """
-    features, map_ = inputs.load(Features, "extract"), inputs.load(Map, "loop")
+    features, map_, when = inputs.load(Features, "extract"), inputs.load(Map, "loop"), inputs.load(Timing, "loop")
     T_wc = frame_poses(inputs.load(Tracks, "loop"), map_)
     T_wc[map_.kf_frame] = map_.T_wk
-    T_wd = timing.depth_poses(features.stamp, features.depth_stamp, T_wc)
+    T_wd = timing.depth_poses(features.stamp, features.depth_stamp + float(when.depth_delay), T_wc)
     chosen = map_.kf_frame if frames == "key" else np.flatnonzero(np.isfinite(T_wd[:, 0, 0]))
     return [(int(frame), T_wd[frame]) for frame in chosen]
-
-
-def keyframe_depth_poses(inputs: Any) -> list[tuple[int, np.ndarray]]:
-    """Give `depth_poses` of the key frames."""
-    return depth_poses(inputs, frames="key")
 
 
 @dataclass(frozen=True)
