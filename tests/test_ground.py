@@ -154,11 +154,11 @@ def test_block_points_lie_on_the_surface_and_match_their_slow_twin():
     T = look_along([2.0, 2.0, 0.7], 0.4, 0.3)
     depth = kinect_noise(render(T), rng)
     for side in (4, 6):
-        got = patches._block_points(depth, KINECT.rays, side, np.float32(5.0))
+        got = patches._block_points(depth, KINECT.rays, side, 5.0)
         np.testing.assert_allclose(got, naive.block_points(depth, KINECT.rays, side, 5.0), rtol=1e-4, atol=1e-5)
     np.testing.assert_allclose(patches._normals(got), naive.normals(got.astype(np.float64)), atol=1e-3)
     assert np.isfinite(patches._normals(got)).any()
-    clean = patches._block_points(render(T, boxes=(), room=((0, 0, 0), (80, 80, 9))), KINECT.rays, 4, np.float32(20.0))
+    clean = patches._block_points(render(T, boxes=(), room=((0, 0, 0), (80, 80, 9))), KINECT.rays, 4, 20.0)
     floor = clean[20:, :, :3].reshape(-1, 3).astype(float)
     height = se3.transform(T, floor[np.isfinite(floor[:, 0])])[:, 2]
     assert len(height) > 300

@@ -5,6 +5,7 @@ at what height, something stands; a second one believes a floor point only when 
 pass adds up the views by [L] (20) to (23), (24) decides.
 """
 
+import math
 from collections.abc import Iterable
 
 import numpy as np
@@ -71,7 +72,8 @@ def fuse(views: list[View], *, settings: GridConfig) -> Grid:
         rows, columns = view.cell[:, 1] - low[1], view.cell[:, 0] - low[0]
         x, y = view.camera[:2] / settings.resolution - low
         band, reach = (settings.band_low, settings.band_high), DEEPEST / settings.resolution
-        is_free = view.is_floor & _is_clear(standing, rows, columns, x, y, view.camera[2], *band, reach)
+        is_free = view.is_floor.copy()
+        _drop_hidden(is_free, standing, rows, columns, x, y, view.camera[2], *band, reach)
         told = is_free | (view.n_band >= settings.n_low)
         update(p_empty, n_seen, rows[told], columns[told], view.n_band[told], settings)
     p_occupied = (1.0 - p_empty).astype(np.float32)
@@ -110,33 +112,33 @@ def check_size(rows: int, columns: int, resolution: float) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _is_clear(standing, rows, columns, camera_x, camera_y, camera_z, low, high, reach):
-    """Say for each cell whether the line of sight from its floor to the camera passes under nothing that hangs into the band.
+def _drop_hidden(is_free, standing, rows, columns, camera_x, camera_y, camera_z, low, high, reach):
+    """Clear `is_free` (N,) of each cell whose floor's line of sight to the camera passes under something that hangs into the band.
 
     It passes under something in a cell where slices above the line are filled, while those around the line are not: a line that goes
     through filled slices only grazes the cell's corner, or what stood there has moved. A line may pass over a low box: what is above
     the line beyond the box was open to view.
     """
-    clear = np.ones(len(rows), dtype=np.bool_)
     for n in range(len(rows)):
+        if not is_free[n]:
+            continue
         x, y = columns[n] + 0.5, rows[n] + 0.5
         dx, dy = camera_x - x, camera_y - y
-        steps = int(np.ceil(max(abs(dx), abs(dy))))
+        steps = math.ceil(abs(dx) if abs(dx) > abs(dy) else abs(dy))
         for s in range(steps + 1):
             t = s / steps if steps > 0 else 0.0
             height = t * camera_z
             if height >= high or t * t * (dx * dx + dy * dy) > reach * reach:
                 break
-            i, j = int(np.floor(y + t * dy)), int(np.floor(x + t * dx))
+            i, j = math.floor(y + t * dy), math.floor(x + t * dx)
             if not (0 <= i < standing.shape[0] and 0 <= j < standing.shape[1]):
                 break
             if standing[i, j]:
-                at = int(SLICES * max(height - low, 0.0) / (high - low))
+                at = int(SLICES * (height - low) / (high - low)) if height > low else 0
                 around = (31 << at) >> 2  # two slices to either side
-                if (int(standing[i, j]) >> (at + 3)) and not (int(standing[i, j]) & around):
-                    clear[n] = False
+                if (standing[i, j] >> (at + 3)) and not (standing[i, j] & around):
+                    is_free[n] = False
                     break
-    return clear
 
 
 def paper_update(p_empty: np.ndarray, n_seen: np.ndarray, rows: np.ndarray, columns: np.ndarray, n: np.ndarray, s: GridConfig) -> None:

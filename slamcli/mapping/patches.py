@@ -4,7 +4,6 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
 from slamcli.geometry import se3
 from slamcli.geometry.camera import Camera
@@ -35,7 +34,7 @@ class Support:
 
 def collect(frames: Iterable[tuple[np.ndarray, np.ndarray]], camera: Camera, *, side: int, max_range: float) -> tuple[Patches, np.ndarray]:
     """Reduce each key frame to surface patches in the world frame; returns Patches and the T_wk (F, 4, 4) kept."""
-    rays = np.ascontiguousarray(camera.rays)
+    rays = camera.rays
     shape = (camera.height // side, camera.width // side)
     kept: list[tuple] = []
     step = 1
@@ -54,7 +53,7 @@ def collect(frames: Iterable[tuple[np.ndarray, np.ndarray]], camera: Camera, *, 
 
 
 def _patches(depth: np.ndarray, rays: np.ndarray, T_wk: np.ndarray, side: int, max_range: float) -> tuple:
-    blocks = _block_points(np.ascontiguousarray(depth, dtype=np.float32), rays, side, np.float32(max_range))
+    blocks = _block_points(depth, rays, side, max_range)
     normal_k = _normals(blocks)
     rows, columns = np.nonzero(np.isfinite(blocks[..., 2]))
     at = blocks[rows, columns].astype(np.float64)
@@ -62,58 +61,48 @@ def _patches(depth: np.ndarray, rays: np.ndarray, T_wk: np.ndarray, side: int, m
     return se3.transform(T_wk, at[:, :3]), normal_w, at[:, 3], np.stack([rows, columns], axis=1).astype(np.int32)
 
 
-@njit(cache=True, nogil=True)
-def _block_points(depth, rays, side, max_range):
-    """Average up to 4 x 4 pixels of each `side` x `side` block to a point x y z and its depth's noise; NaN where it is no one surface.
+def _block_points(depth: np.ndarray, rays: np.ndarray, side: int, max_range: float) -> np.ndarray:
+    """Average up to 4 x 4 pixels of each `side` x `side` block to a point x y z and its depth's noise (R, C, 4), NaN where it is no one surface.
 
     Inverse depth is averaged: on a plane it is linear in the pixel, so that the mean lies on the plane at the pixels' mean ray.
     """
-    rows, columns = depth.shape[0] // side, depth.shape[1] // side
-    step = (side + 3) // 4
-    out = np.full((rows, columns, 4), np.nan, dtype=np.float32)
-    for r in range(rows):
-        for c in range(columns):
-            n, tried, total, total_x, total_y = 0, 0, 0.0, 0.0, 0.0
-            low, high = np.inf, 0.0
-            for i in range(r * side, (r + 1) * side, step):
-                for j in range(c * side, (c + 1) * side, step):
-                    tried += 1
-                    z = depth[i, j]
-                    if z > 0.0 and z <= max_range:
-                        n += 1
-                        total += 1.0 / z
-                        total_x += rays[i, j, 0]
-                        total_y += rays[i, j, 1]
-                        low, high = min(low, z), max(high, z)
-            # A block on a floor seen at a flat angle spans much depth, so the bound on the spread is wide; it only rejects edges.
-            if 2 * n >= tried and high - low <= 0.02 + 0.1 * low:
-                z = n / total
-                out[r, c, 0], out[r, c, 1], out[r, c, 2] = z * total_x / n, z * total_y / n, z
-                out[r, c, 3] = 0.0012 + 0.0019 * (z - 0.4) * (z - 0.4)
+    z = _samples(depth, side).astype(np.float64)
+    has = (z > 0.0) & (z <= max_range)
+    z[~has] = np.nan
+    n = has.sum(axis=0)
+    low, high = np.fmin.reduce(z, axis=0), np.fmax.reduce(z, axis=0)
+    # A block on a floor seen at a flat angle spans much depth, so the bound on the spread is wide; it only rejects edges.
+    is_one = (2 * n >= len(z)) & (high - low <= 0.02 + 0.1 * low)
+    n, has = n[is_one], has[:, is_one]
+    z = n / np.where(has, 1.0 / z[:, is_one], 0.0).sum(axis=0)
+    x, y = (z * np.where(has, _samples(rays[..., k], side)[:, is_one], 0.0).sum(axis=0, dtype=np.float64) / n for k in range(2))
+    out = np.full((*is_one.shape, 4), np.nan, dtype=np.float32)
+    out[is_one] = np.column_stack([x, y, z, 0.0012 + 0.0019 * (z - 0.4) * (z - 0.4)])
     return out
 
 
-@njit(cache=True, nogil=True)
-def _normals(points):
+def _samples(image: np.ndarray, side: int) -> np.ndarray:
+    """Give up to 4 x 4 pixels (S, R, C) of each block of an image (H, W)."""
+    rows, columns = image.shape[0] // side, image.shape[1] // side
+    step = (side + 3) // 4
+    per_side = -(-side // step)
+    blocks = image[: rows * side, : columns * side].reshape(rows, side, columns, side)
+    return blocks[:, ::step, :, ::step].transpose(1, 3, 0, 2).reshape(per_side * per_side, rows, columns)
+
+
+def _normals(points: np.ndarray) -> np.ndarray:
     """Give unit normals (R, C, 3) towards the camera by central differences over the blocks' points; NaN at edges and jumps of depth."""
-    rows, columns = points.shape[0], points.shape[1]
-    out = np.full((rows, columns, 3), np.nan)
-    for r in range(1, rows - 1):
-        for c in range(1, columns - 1):
-            ax = points[r, c + 1, 0] - points[r, c - 1, 0]
-            ay = points[r, c + 1, 1] - points[r, c - 1, 1]
-            az = points[r, c + 1, 2] - points[r, c - 1, 2]
-            bx = points[r + 1, c, 0] - points[r - 1, c, 0]
-            by = points[r + 1, c, 1] - points[r - 1, c, 1]
-            bz = points[r + 1, c, 2] - points[r - 1, c, 2]
-            reach = 0.15 * points[r, c, 2]
-            nx, ny, nz = by * az - bz * ay, bz * ax - bx * az, bx * ay - by * ax
-            length = np.sqrt(nx * nx + ny * ny + nz * nz)
-            if not (abs(az) < reach and abs(bz) < reach and length > 0.0):
-                continue
-            if nx * points[r, c, 0] + ny * points[r, c, 1] + nz * points[r, c, 2] > 0.0:
-                length = -length
-            out[r, c, 0], out[r, c, 1], out[r, c, 2] = nx / length, ny / length, nz / length
+    out = np.full((*points.shape[:2], 3), np.nan)
+    middle = points[1:-1, 1:-1, :3]
+    a = points[1:-1, 2:, :3] - points[1:-1, :-2, :3]
+    b = points[2:, 1:-1, :3] - points[:-2, 1:-1, :3]
+    normal = np.cross(b, a)
+    length = np.sqrt(np.einsum("rck,rck->rc", normal, normal))
+    reach = 0.15 * middle[..., 2]
+    is_smooth = (np.abs(a[..., 2]) < reach) & (np.abs(b[..., 2]) < reach) & (length > 0.0)
+    faces_away = (normal * middle).sum(axis=-1) > 0.0
+    length = np.where(faces_away, -length, length)
+    out[1:-1, 1:-1][is_smooth] = normal[is_smooth] / length[is_smooth][:, None]
     return out
 
 

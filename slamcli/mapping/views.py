@@ -1,5 +1,6 @@
 """What single depth images tell about the cells of the grid: points in the robot's height band, floor, and lines of sight just above it."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -43,19 +44,7 @@ def look(depth: np.ndarray, rays: np.ndarray, T_lk: np.ndarray, *, settings: Gri
         sensor.depth_noise_base, sensor.depth_noise_quadratic, n_band, slices, floor,
     )  # fmt: skip
     if settings.extend_down:
-        _extend_down(
-            depth,
-            rays,
-            T_lk,
-            centre - half,
-            settings.stride,
-            cell,
-            settings.min_range,
-            settings.max_range,
-            settings.band_high,
-            n_band,
-            slices,
-        )
+        _extend_down(depth, rays, T_lk, centre - half, settings, n_band, slices)
     rows, columns = np.nonzero((n_band > 0) | (floor > 0))
     return View(
         cell=np.stack([columns + int(centre[0]) - half, rows + int(centre[1]) - half], axis=1).astype(np.int32),
@@ -87,7 +76,7 @@ def _sort_points(depth, rays, T, corner, stride, cell, near, far, low, high, noi
             if height >= high:
                 continue
             x, y = (T[0, 3] + z * dx) / cell - corner[0], (T[1, 3] + z * dy) / cell - corner[1]
-            i, j = int(np.floor(y)), int(np.floor(x))
+            i, j = math.floor(y), math.floor(x)
             if not (0 <= i < side and 0 <= j < side):
                 continue
             noise = abs(dz) * (noise_base + noise_quadratic * (z - 0.4) * (z - 0.4))
@@ -102,40 +91,38 @@ def _sort_points(depth, rays, T, corner, stride, cell, near, far, low, high, noi
                     continue
                 floor[i, j] = 1
                 # Back along the ray, as long as it is below the band.
-                reach = min(low - max(height, 0.0), T[2, 3] - height) / -dz
-                length = reach * np.sqrt(dx * dx + dy * dy) / cell
-                steps = int(length)
+                rise = low - height if height > 0.0 else low
+                if rise > T[2, 3] - height:
+                    rise = T[2, 3] - height
+                reach = rise / -dz
+                steps = int(reach * math.sqrt(dx * dx + dy * dy) / cell)
                 for s in range(1, steps + 1):
                     back = reach * s / (steps + 1)
-                    i2, j2 = int(np.floor(y - back * dy / cell)), int(np.floor(x - back * dx / cell))
+                    i2, j2 = math.floor(y - back * dy / cell), math.floor(x - back * dx / cell)
                     if 0 <= i2 < side and 0 <= j2 < side:
                         floor[i2, j2] = 1
 
 
-@njit(cache=True, nogil=True)
-def _extend_down(depth, rays, T, corner, stride, cell, near, far, high, n_band, slices):
+def _extend_down(
+    depth: np.ndarray, rays: np.ndarray, T_lk: np.ndarray, corner: np.ndarray, s: GridConfig, n_band: np.ndarray, slices: np.ndarray
+) -> None:
     """Count upright surfaces that leave the picture downwards above the band as standing in it: a box seen from close by, a wall.
 
     Upright: over a twelfth of the picture, 5 cm at 0.7 m and so more than the edge of a table top, the height changes by three times
     as much as the place.
     """
-    side = n_band.shape[0]
-    rows = depth.shape[0]
-    apart = rows // 12
-    for u in range(stride // 2, depth.shape[1], stride):
-        for v in range(rows - 1, rows - 1 - rows // 16, -1):
-            z, z2 = depth[v, u], depth[v - apart, u]
-            if not (z >= near and z <= far):
-                continue
-            x, y = z * rays[v, u, 0], z * rays[v, u, 1]
-            dx, dy, dz = x - z2 * rays[v - apart, u, 0], y - z2 * rays[v - apart, u, 1], z - z2
-            rise = abs(T[2, 0] * dx + T[2, 1] * dy + T[2, 2] * dz)
-            along_x, along_y = T[0, 0] * dx + T[0, 1] * dy + T[0, 2] * dz, T[1, 0] * dx + T[1, 1] * dy + T[1, 2] * dz
-            height = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
-            if height >= high and rise > 3.0 * np.sqrt(along_x * along_x + along_y * along_y):
-                i = int(np.floor((T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]) / cell - corner[1]))
-                j = int(np.floor((T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]) / cell - corner[0]))
-                if 0 <= i < side and 0 <= j < side:
-                    n_band[i, j] += 1
-                    slices[i, j] = ALL_SLICES
-            break
+    height, width = depth.shape
+    u = np.arange(s.stride // 2, width, s.stride)
+    lowest = depth[height - height // 16 :, u][::-1]
+    is_reading = (lowest >= s.min_range) & (lowest <= s.max_range)
+    u, v = u[is_reading.any(axis=0)], height - 1 - is_reading.argmax(axis=0)[is_reading.any(axis=0)]
+    at, above = (
+        np.column_stack([depth[v, u, None] * rays[v, u], depth[v, u]]).astype(np.float64) @ T_lk[:3, :3].T + T_lk[:3, 3]
+        for v in (v, v - height // 12)
+    )
+    step = np.abs(at - above)
+    is_upright = (at[:, 2] >= s.band_high) & (step[:, 2] > 3.0 * np.hypot(step[:, 0], step[:, 1]))
+    j, i = np.floor(at[is_upright, :2] / s.resolution - corner).astype(np.int64).T
+    inside = (i >= 0) & (j >= 0) & (i < n_band.shape[0]) & (j < n_band.shape[1])
+    np.add.at(n_band, (i[inside], j[inside]), 1)
+    slices[i[inside], j[inside]] = ALL_SLICES
