@@ -10,7 +10,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from slamcli import __version__, console, files, freshness, rundir
+from slamcli import __version__, compilation, console, files, freshness, rundir
 from slamcli.config import Config
 from slamcli.errors import SlamError
 from slamcli.freshness import State
@@ -193,6 +193,7 @@ class Pipeline:
         if stage is STAGES[0]:  # the record of the first stage is where the recording's own faults belong
             for warning in self.dataset().warnings:
                 tools.warn(warning)
+        compilation.ensure()
         with self.run.writing(stage.name) as out:
             try:
                 with Meter() as meter, one_thread_in_blas():

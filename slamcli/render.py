@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numba import njit
 
 from slamcli.errors import SlamError
 from slamcli.geometry import voxel
 from slamcli.geometry.octree import CENTRE, DEPTH, Octree, expand
+from slamcli.kernels import kernel
 
 BACKGROUND = (232, 235, 240)  # off white, against which white walls show
 PATH_COLOUR = (214, 39, 40)
@@ -167,7 +167,7 @@ def _visible_faces(tree: Octree, threshold: float) -> tuple[np.ndarray, np.ndarr
     return cell[shown], faces[shown]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _splat(pixel, rgb, width_at_1m, image, z_buffer):
     """Draw each point as a square facing the camera, nearest wins."""
     rows, columns = z_buffer.shape
@@ -185,7 +185,7 @@ def _splat(pixel, rgb, width_at_1m, image, z_buffer):
                     image[v, u, 0], image[v, u, 1], image[v, u, 2] = rgb[i, 0], rgb[i, 1], rgb[i, 2]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _fill_triangles(corner, rgb, image, z_buffer):
     """Fill triangles (N, 3, [x, y, depth]) of one colour each, nearest wins; inverse depth is linear in the picture."""
     rows, columns = z_buffer.shape

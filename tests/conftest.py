@@ -8,11 +8,19 @@ import pytest
 from click.testing import CliRunner, Result
 from hypothesis import settings
 
+from slamcli import compilation
+
 ROOM_FRAMES = 40
 
 # A kernel's first call compiles it, which takes longer than any deadline; and the same examples every time, as a red run must be repeatable.
 settings.register_profile("slamcli", deadline=None, derandomize=True)
 settings.load_profile("slamcli")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Compile the kernels once, before several processes begin to test with them."""
+    if not hasattr(config, "workerinput"):
+        compilation.ensure()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -2,7 +2,6 @@
 
 import errno
 import importlib
-import importlib.util
 from typing import Any
 
 import click
@@ -73,6 +72,5 @@ def _commands_of(module: Any) -> list[click.Command]:
 
 
 for topic in TOPICS:
-    if importlib.util.find_spec(f"slamcli.cli.{topic}"):
-        for command in _commands_of(importlib.import_module(f"slamcli.cli.{topic}")):
-            cli.add_command(verbose_option(command))
+    for command in _commands_of(importlib.import_module(f"slamcli.cli.{topic}")):
+        cli.add_command(verbose_option(command))

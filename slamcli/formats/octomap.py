@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import BinaryIO, Literal
 
 import numpy as np
-from numba import njit
 
 from slamcli.errors import SlamError
 from slamcli.geometry.octree import DEPTH, Octree, levels, preorder, prune
+from slamcli.kernels import kernel
 
 MAGIC = {".ot": b"# Octomap OcTree file", ".bt": b"# Octomap OcTree binary file"}
 NODE = np.dtype([("log_odds", "<f4"), ("children", "u1")])
@@ -136,7 +136,7 @@ def _number(path: Path, values: dict[str, str], name: str, kind: type, low: floa
     return value
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _parse_ot(value, children, key, depth, log_odds):
     """Walk the nodes depth first and list the leaves; returns fault, leaves, nodes."""
     prefix = np.zeros(DEPTH + 1, dtype=np.int64)  # key of the open node at each depth
@@ -168,7 +168,7 @@ def _parse_ot(value, children, key, depth, log_odds):
         level += 1
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _parse_bt(code, free, occupied, key, depth, log_odds):
     """Walk the inner nodes depth first and list the leaves; returns fault, leaves, nodes, bytes used."""
     prefix = np.zeros(DEPTH + 1, dtype=np.int64)

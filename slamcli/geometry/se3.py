@@ -5,9 +5,9 @@ on the left: ``T <- exp(xi) @ T``. Every function takes stacks: (..., 4, 4) matr
 """
 
 import numpy as np
-from numba import njit
 
 from slamcli.errors import SlamError
+from slamcli.kernels import kernel
 
 SMALL_ANGLE = 1e-4  # [rad] below this the series in phi^2 are exact to double precision after two terms
 
@@ -155,7 +155,7 @@ def umeyama(x_a: np.ndarray, x_b: np.ndarray, *, with_scale: bool = False) -> tu
     return T_ba, scale
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def left_update(T, xi):
     """Replace T (4, 4) in place by exp(xi) @ T, written out for use inside kernels."""
     p0, p1, p2 = xi[3], xi[4], xi[5]

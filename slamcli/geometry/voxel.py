@@ -5,9 +5,10 @@ consecutive keys are the children of one octree node. Keys are kept in int64, as
 """
 
 import numpy as np
-from numba import njit
+from numba import i4, i8
 
 from slamcli.errors import SlamError
+from slamcli.kernels import kernel
 
 AXIS_BITS = 21  # per axis in a Morton key
 GOLDEN = -7046029254386353131  # 2^64 / golden ratio as int64: Fibonacci hashing, Knuth, TAOCP 3, section 6.4
@@ -33,8 +34,8 @@ def _gather(x):
     return (x ^ (x >> 32)) & 0x1FFFFF
 
 
-spread = njit(cache=True, nogil=True)(_spread)
-gather = njit(cache=True, nogil=True)(_gather)
+spread = kernel(_spread)
+gather = kernel(_gather)
 
 
 def morton(cell: np.ndarray) -> np.ndarray:
@@ -49,13 +50,13 @@ def unmorton(key: np.ndarray) -> np.ndarray:
     return np.stack([_gather(key), _gather(key >> 1), _gather(key >> 2)], axis=-1)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def first_slot(key, mask):
     """Give the slot a key's search starts at; the eight children of a node share a cache line."""
     return (((key >> 3) * GOLDEN >> 32) + (key & 7)) & mask
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def find_row(slot_row, row_key, key):
     """Give the row of a key, -1 where it has none."""
     mask = slot_row.size - 1
@@ -67,7 +68,7 @@ def find_row(slot_row, row_key, key):
     return -1
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def find_or_add(slot_row, row_key, n_rows, key):
     """Give the row of a key; a new key gets row `n_rows`, and it is the caller who counts on. The table must have room."""
     mask = slot_row.size - 1
@@ -81,8 +82,8 @@ def find_or_add(slot_row, row_key, n_rows, key):
     return n_rows
 
 
-@njit(cache=True, nogil=True)
-def _fill_slots(slot_row, row_key, n_rows):
+@kernel
+def _fill_slots(slot_row: i4[::1], row_key: i8[::1], n_rows: i8):
     mask = slot_row.size - 1
     for row in range(n_rows):
         slot = first_slot(row_key[row], mask)

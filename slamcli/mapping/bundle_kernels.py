@@ -8,16 +8,26 @@ and with depth. Products and sums may be contracted (`fastmath`), nothing else: 
 """
 
 import numpy as np
-from numba import njit, uint64
+from numba import f8, i4, i8, u8, uint64
 
 from slamcli.geometry.se3 import left_update
+from slamcli.kernels import kernel
 
 Z_MIN = 1e-2  # [m] a landmark nearer to the image plane than this, or behind it, has no projection
 CHI2_BEHIND = 1e6  # what such an observation costs: more than any that can be seen, yet finite, and no slope
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
-def evaluate(T, x_w, obs_kf, offset, measured, camera, limits, chi2):
+@kernel(error_model="numpy", fastmath={"contract"})
+def evaluate(
+    T: f8[:, :, ::1],
+    x_w: f8[:, ::1],
+    obs_kf: u8[::1],
+    offset: i8[::1],
+    measured: f8[:, ::1],
+    camera: f8[::1],
+    limits: f8[::1],
+    chi2: f8[::1],
+):
     """Write chi2 (O,), 0 where switched off, and return the sum of Huber's costs."""
     fx, fy, cx, cy = camera[0], camera[1], camera[2], camera[3]
     cost = 0.0
@@ -39,8 +49,22 @@ def evaluate(T, x_w, obs_kf, offset, measured, camera, limits, chi2):
     return cost
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
-def linearize(T, x_w, obs_kf, offset, place, measured, camera, limits, U, b_c, V, b_l, W):
+@kernel(error_model="numpy", fastmath={"contract"})
+def linearize(
+    T: f8[:, :, ::1],
+    x_w: f8[:, ::1],
+    obs_kf: u8[::1],
+    offset: i8[::1],
+    place: i8[::1],
+    measured: f8[:, ::1],
+    camera: f8[::1],
+    limits: f8[::1],
+    U: f8[:, :, ::1],
+    b_c: f8[:, ::1],
+    V: f8[:, :, ::1],
+    b_l: f8[:, ::1],
+    W: f8[:, :, ::1],
+):
     """Add up the blocks of the normal equations with Huber's weights, in arrays that hold 0 before.
 
     U (n, 6, 6) and b_c (n, 6) of the free key frames, V (L, 3, 3) and b_l (L, 3) of the landmarks, upper triangles alone;
@@ -116,8 +140,24 @@ def linearize(T, x_w, obs_kf, offset, place, measured, camera, limits, U, b_c, V
             g[5] -= x * q1 - y * q0
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
-def eliminate(U, b_c, V, b_l, W, obs_kf, offset, place, damping, hold, block_of, S, rhs, V_inv, Y):
+@kernel(error_model="numpy", fastmath={"contract"})
+def eliminate(
+    U: f8[:, :, ::1],
+    b_c: f8[:, ::1],
+    V: f8[:, :, ::1],
+    b_l: f8[:, ::1],
+    W: f8[:, :, ::1],
+    obs_kf: u8[::1],
+    offset: i8[::1],
+    place: i8[::1],
+    damping: f8,
+    hold: f8[::1],
+    block_of: i4[:, ::1],
+    S: f8[:, :, ::1],
+    rhs: f8[:, ::1],
+    V_inv: f8[:, ::1],
+    Y: f8[:, :, ::1],
+):
     """Assemble the reduced camera system S dx_c = rhs, the Schur complement of the landmarks.
 
     S (B, 6, 6), which holds 0 before, are the blocks on and above the diagonal, block_of (n, n) their numbers; on the diagonal only the
@@ -170,8 +210,25 @@ def eliminate(U, b_c, V, b_l, W, obs_kf, offset, place, damping, hold, block_of,
                     S[s, i, 5] -= y0 * w05 + y1 * w15 + y2 * w25
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
-def step(T, x_w, U, b_c, V, b_l, W, V_inv, obs_kf, offset, place, damping, hold, dx, T_new, x_new):
+@kernel(error_model="numpy", fastmath={"contract"})
+def step(
+    T: f8[:, :, ::1],
+    x_w: f8[:, ::1],
+    U: f8[:, :, ::1],
+    b_c: f8[:, ::1],
+    V: f8[:, :, ::1],
+    b_l: f8[:, ::1],
+    W: f8[:, :, ::1],
+    V_inv: f8[:, ::1],
+    obs_kf: u8[::1],
+    offset: i8[::1],
+    place: i8[::1],
+    damping: f8,
+    hold: f8[::1],
+    dx: f8[:, ::1],
+    T_new: f8[:, :, ::1],
+    x_new: f8[:, ::1],
+):
     """Back-substitute the landmarks, write the moved poses and landmarks; return the decrease of the cost to be expected."""
     expected = 0.0
     for k in range(len(T)):

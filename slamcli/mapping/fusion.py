@@ -7,12 +7,13 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numba import njit
+from numba import f4, f8, i4, i8, u1
 
 from slamcli.config import SurfaceConfig
 from slamcli.geometry import se3, voxel
 from slamcli.geometry.camera import Camera
 from slamcli.geometry.voxel import find_or_add, spread
+from slamcli.kernels import kernel
 from slamcli.mapping import outliers
 
 HALF_EXTENT = outliers.HALF_EXTENT
@@ -94,9 +95,24 @@ def _rays(camera: Camera) -> np.ndarray:
     return camera.rays
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _find_surface(
-    inverse, rays, stride, near, edge, window, low, high, noise_base, noise_quadratic, min_cosine, steepest, pixel, xyz_c, normal_c, weight
+    inverse: f4[:, ::1],
+    rays: f4[:, :, ::1],
+    stride: i8,
+    near: f8,
+    edge: i8,
+    window: f8,
+    low: f8,
+    high: f8,
+    noise_base: f8,
+    noise_quadratic: f8,
+    min_cosine: f8,
+    steepest: f8,
+    pixel: i4[::1],
+    xyz_c: f4[:, ::1],
+    normal_c: f4[:, ::1],
+    weight: f4[::1],
 ):
     """Fill the surface's pixels, points, normals and weights; returns their number. Missing readings are NaN and fail every test."""
     height, width = inverse.shape
@@ -138,7 +154,7 @@ def _find_surface(
     return n
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _fit_pairs(inverse, v, u, half, limit):
     """Sum the pairs of opposite pixels that agree with (v, u) and fit the slopes of inverse depth.
 
@@ -168,7 +184,7 @@ def _fit_pairs(inverse, v, u, half, limit):
     return n, np.float64(total), (vv * uq - uv * vq) * scale, (uu * vq - uv * uq) * scale
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _is_at_jump(inverse, v, u, distance, limit):
     """Say whether a neighbour up, down, left or right differs by more than the limit, or two opposite ones are missing."""
     height, width = inverse.shape
@@ -230,8 +246,21 @@ class VoxelCloud:
         return Cloud(xyz[keep].astype(np.float32), rgb[keep], normal[keep])
 
 
-@njit(cache=True, nogil=True)
-def _add_points(pixel, xyz_c, normal_c, weight, rgb, T_wc, per_side, slot_row, row_key, n_rows, sums, count):
+@kernel
+def _add_points(
+    pixel: i4[::1],
+    xyz_c: f4[:, ::1],
+    normal_c: f4[:, ::1],
+    weight: f4[::1],
+    rgb: u1[:, ::1],
+    T_wc: f8[:, ::1],
+    per_side: f8,
+    slot_row: i4[::1],
+    row_key: i8[::1],
+    n_rows: i8,
+    sums: f4[:, ::1],
+    count: i4[::1],
+):
     """Add weighted points to their voxels; sums are weight, offset from the centre [voxels], normal, colour. Returns the rows in use."""
     half = 1 << 20
     for i in range(len(pixel)):

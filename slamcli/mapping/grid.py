@@ -9,11 +9,12 @@ import math
 from collections.abc import Iterable
 
 import numpy as np
-from numba import njit
+from numba import b1, f8, i8, u2
 
 from slamcli.config import GridConfig, SensorConfig
 from slamcli.errors import SlamError
 from slamcli.geometry.camera import Camera
+from slamcli.kernels import kernel
 from slamcli.mapping.views import SLICES, View, look
 from slamcli.schema import Grid
 
@@ -111,8 +112,19 @@ def check_size(rows: int, columns: int, resolution: float) -> None:
         )
 
 
-@njit(cache=True, nogil=True)
-def _drop_hidden(is_free, standing, rows, columns, camera_x, camera_y, camera_z, low, high, reach):
+@kernel
+def _drop_hidden(
+    is_free: b1[::1],
+    standing: u2[:, ::1],
+    rows: i8[::1],
+    columns: i8[::1],
+    camera_x: f8,
+    camera_y: f8,
+    camera_z: f8,
+    low: f8,
+    high: f8,
+    reach: f8,
+):
     """Clear `is_free` (N,) of each cell whose floor's line of sight to the camera passes under something that hangs into the band.
 
     It passes under something in a cell where slices above the line are filled, while those around the line are not: a line that goes

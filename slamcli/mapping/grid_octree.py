@@ -5,11 +5,11 @@ that hangs, it may be the inside of it; such columns stay unknown however well t
 """
 
 import numpy as np
-from numba import njit
 from scipy import ndimage
 
 from slamcli.config import GridConfig
 from slamcli.geometry.octree import Octree
+from slamcli.kernels import kernel
 from slamcli.mapping.grid import DEEPEST, FREE, OCCUPIED, UNKNOWN, check_size
 from slamcli.mapping.views import SLICES
 from slamcli.schema import Grid
@@ -66,7 +66,7 @@ def _slices(low: np.ndarray, high: np.ndarray, settings: GridConfig) -> np.ndarr
     return ((1 << last) - (1 << np.minimum(first, last))).astype(np.uint16)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _fill(first, last, slices, is_occupied, log_odds, full, free, known, odds):
     for n in range(len(slices)):
         mask = slices[n]

@@ -1,10 +1,11 @@
 """The growing map: key frames, landmarks and observations. The only mutable store of the tracker."""
 
 import numpy as np
-from numba import njit
+from numba import b1, f8, i4, i8, u1, u8
 
 from slamcli.geometry import se3
 from slamcli.geometry.bits import hamming
+from slamcli.kernels import kernel
 from slamcli.mapping.growable import Table
 from slamcli.mapping.projection import Candidates
 from slamcli.schema import Features, Map
@@ -214,8 +215,8 @@ class MapBuilder:
         return se3.inverse(self.kf.T_wk[kfs])
 
 
-@njit(cache=True, nogil=True)
-def _link(head, n_obs, next_, obs_lm, start):
+@kernel
+def _link(head: i4[::1], n_obs: i4[::1], next_: i4[::1], obs_lm: i4[::1], start: i8):
     for o in range(start, len(obs_lm)):
         lm = obs_lm[o]
         next_[o] = head[lm]
@@ -223,8 +224,8 @@ def _link(head, n_obs, next_, obs_lm, start):
         n_obs[lm] += 1
 
 
-@njit(cache=True, nogil=True)
-def _count_views(ids, head, next_, obs_kf, counts):
+@kernel
+def _count_views(ids: i4[::1], head: i4[::1], next_: i4[::1], obs_kf: i4[::1], counts: i4[::1]):
     for lm in ids:
         o = head[lm]
         while o >= 0:
@@ -233,8 +234,8 @@ def _count_views(ids, head, next_, obs_kf, counts):
             o = next_[o]
 
 
-@njit(cache=True, nogil=True)
-def _gather(ids, head, next_, obs_kf, obs_row, which, kf, row):
+@kernel
+def _gather(ids: i4[::1], head: i4[::1], next_: i4[::1], obs_kf: i4[::1], obs_row: i8[::1], which: i4[::1], kf: i4[::1], row: i8[::1]):
     n = 0
     for i in range(len(ids)):
         o = head[ids[i]]
@@ -246,8 +247,10 @@ def _gather(ids, head, next_, obs_kf, obs_row, which, kf, row):
     return n
 
 
-@njit(cache=True, nogil=True)
-def _unlink(rows, lm_of_row, head, n_obs, is_alive, next_, obs_kf, obs_row):
+@kernel
+def _unlink(
+    rows: i8[::1], lm_of_row: i4[::1], head: i4[::1], n_obs: i4[::1], is_alive: b1[::1], next_: i4[::1], obs_kf: i4[::1], obs_row: i8[::1]
+):
     for row in rows:
         lm = lm_of_row[row]
         if lm < 0:
@@ -264,8 +267,18 @@ def _unlink(rows, lm_of_row, head, n_obs, is_alive, next_, obs_kf, obs_row):
             is_alive[lm] = False
 
 
-@njit(cache=True, nogil=True)
-def _fuse(kept, gone, lm_of_row, head, n_obs, next_, obs_lm, obs_kf, obs_row):
+@kernel
+def _fuse(
+    kept: i8,
+    gone: i8,
+    lm_of_row: i4[::1],
+    head: i4[::1],
+    n_obs: i4[::1],
+    next_: i4[::1],
+    obs_lm: i4[::1],
+    obs_kf: i4[::1],
+    obs_row: i8[::1],
+):
     o = head[gone]
     while o >= 0:
         following = next_[o]
@@ -291,8 +304,22 @@ def _fuse(kept, gone, lm_of_row, head, n_obs, next_, obs_lm, obs_kf, obs_row):
     n_obs[gone] = 0
 
 
-@njit(cache=True, nogil=True)
-def _refresh(ids, head, next_, obs_kf, obs_row, xyz, T_wk, desc, octave, octave_scale, lm_desc, direction, reach):
+@kernel
+def _refresh(
+    ids: i4[::1],
+    head: i4[::1],
+    next_: i4[::1],
+    obs_kf: i4[::1],
+    obs_row: i8[::1],
+    xyz: f8[:, ::1],
+    T_wk: f8[:, :, ::1],
+    desc: u8[:, ::1],
+    octave: u1[::1],
+    octave_scale: f8,
+    lm_desc: u8[:, ::1],
+    direction: f8[:, ::1],
+    reach: f8[::1],
+):
     # Views beyond the latest 16 add nothing to the mean direction and would make the medoid quadratic in a landmark's life.
     rows = np.empty(16, dtype=np.int64)
     for lm in ids:

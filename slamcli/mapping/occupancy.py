@@ -11,12 +11,13 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
+from numba import b1, f4, f8, i4, i8, u1, u8
 
 from slamcli.errors import SlamError
 from slamcli.geometry import voxel
 from slamcli.geometry.octree import CENTRE, DEPTH, Octree
 from slamcli.geometry.voxel import find_or_add, spread
+from slamcli.kernels import kernel
 
 BLOCK_CELLS = 512  # 8 x 8 x 8, within a block in Morton order
 MAX_MARKS = 1 << 30  # cells of one scan's bounding box, a byte each
@@ -148,8 +149,10 @@ def _cell_centres(x_w: np.ndarray, resolution: float) -> np.ndarray:
     return ((cell - CENTRE + 0.5) * resolution).astype(np.float32)
 
 
-@njit(cache=True, nogil=True)
-def _ray_ends(x_w, origin, max_range, resolution, end, end_cell, is_hit, box):
+@kernel
+def _ray_ends(
+    x_w: f4[:, ::1], origin: f4[::1], max_range: f8, resolution: f8, end: f4[:, ::1], end_cell: i8[:, ::1], is_hit: b1[::1], box: i8[:, ::1]
+):
     """Cut rays off at the range, find their end cells and the bounding box of all cells; returns the number of rays kept."""
     factor = 1.0 / resolution
     ox, oy, oz = origin[0], origin[1], origin[2]
@@ -181,8 +184,8 @@ def _ray_ends(x_w, origin, max_range, resolution, end, end_cell, is_hit, box):
     return n
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _ray_times(end, origin, resolution, t_next, t_cell, reach):
+@kernel(error_model="numpy")
+def _ray_times(end: f4[:, ::1], origin: f4[::1], resolution: f8, t_next: f8[:, ::1], t_cell: f8[:, ::1], reach: f4[::1]):
     """Fill per axis the ray lengths at which the first cell face is crossed and between faces, and each ray's length.
 
     A pass of its own, as the compiler turns it into vector instructions: the divisions would else cost as much as the walk.
@@ -201,8 +204,19 @@ def _ray_times(end, origin, resolution, t_next, t_cell, reach):
             per_cell[i] = resolution / abs(slope) if slope != 0.0 else np.inf
 
 
-@njit(cache=True, nogil=True)
-def _cast_rays(end, end_cell, t_next, t_cell, reach, origin, resolution, lower, shape, marks):
+@kernel
+def _cast_rays(
+    end: f4[:, ::1],
+    end_cell: i8[:, ::1],
+    t_next: f8[:, ::1],
+    t_cell: f8[:, ::1],
+    reach: f4[::1],
+    origin: f4[::1],
+    resolution: f8,
+    lower: i8[::1],
+    shape: i8[::1],
+    marks: u1[::1],
+):
     """Mark the cells that rays pass, without their end cells.
 
     Axis c is the one along which a ray crosses most faces. Rays on which rounding might matter are walked from face to face.
@@ -248,7 +262,7 @@ def _cast_rays(end, end_cell, t_next, t_cell, reach, origin, resolution, lower, 
                 marks[at + (sa if ta < tb else sb)] = FREE
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _march(at, n, ta, tb, tc, ca, cb, cc, sa, sb, sc, a_before_c, b_before_c, marks):
     """Mark the cells along n faces of axis c, of which none of axis a or b crosses more.
 
@@ -273,12 +287,12 @@ def _march(at, n, ta, tb, tc, ca, cb, cc, sa, sb, sc, a_before_c, b_before_c, ma
     return at, ta, tb
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _flat(x, y, z, shape):
     return np.uint64((z * shape[1] + y) * shape[0] + x)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _is_regular(ta, tb, tc, ca, cb, cc, na, nb, nc, reach):
     """Say whether the walk reaches its end cell by as many faces as lie between, clear of rounding."""
     slack = ROUNDING * reach
@@ -295,7 +309,7 @@ def _is_regular(ta, tb, tc, ca, cb, cc, na, nb, nc, reach):
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _walk(start_cell, end_cell, origin, end, t_next, t_cell, reach, lower, shape, marks):
     """Mark the cells of one ray from face to face, by OctoMap's rules for ties and for rays that miss their end cell.
 
@@ -318,15 +332,15 @@ def _walk(start_cell, end_cell, origin, end, t_next, t_cell, reach, lower, shape
             break
 
 
-@njit(cache=True, nogil=True)
-def _mark_ends(end_cell, is_hit, lower, marks):
+@kernel
+def _mark_ends(end_cell: i8[:, ::1], is_hit: b1[::1], lower: i8[::1], marks: u1[:, :, ::1]):
     for i in range(len(end_cell)):
         if is_hit[i]:
             marks[end_cell[i, 2] - lower[2], end_cell[i, 1] - lower[1], end_cell[i, 0] - lower[0]] = OCCUPIED
 
 
-@njit(cache=True, nogil=True)
-def _touch_blocks(rows_of_8, block_row):
+@kernel
+def _touch_blocks(rows_of_8: u8[:, :, ::1], block_row: i4[:, :, ::1]):
     """Flag the blocks that hold a marked cell; returns their number."""
     n = 0
     for z in range(rows_of_8.shape[0]):
@@ -338,8 +352,20 @@ def _touch_blocks(rows_of_8, block_row):
     return n
 
 
-@njit(cache=True, nogil=True)
-def _update_cells(rows_of_8, lower, block_row, slot_row, row_key, n_rows, value, miss, hit, lowest, highest):
+@kernel
+def _update_cells(
+    rows_of_8: u8[:, :, ::1],
+    lower: i8[::1],
+    block_row: i4[:, :, ::1],
+    slot_row: i4[::1],
+    row_key: i8[::1],
+    n_rows: i8,
+    value: f4[:, ::1],
+    miss: f4,
+    hit: f4,
+    lowest: f4,
+    highest: f4,
+):
     """Update every marked cell once, (11) and (13) of Zhao et al. with clamping; returns the number of blocks."""
     bx, by, bz = lower[0] >> 3, lower[1] >> 3, lower[2] >> 3
     for z in range(rows_of_8.shape[0]):

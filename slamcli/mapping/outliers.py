@@ -1,10 +1,11 @@
 """Stray points of a voxel cloud."""
 
 import numpy as np
-from numba import njit
+from numba import f4, i4, i8
 
 from slamcli.geometry import voxel
 from slamcli.geometry.voxel import find_or_add, find_row, gather, spread
+from slamcli.kernels import kernel
 
 HALF_EXTENT = 1 << (voxel.AXIS_BITS - 1)  # voxels from the origin to the map's border, per axis
 CELL_BITS = 2
@@ -37,14 +38,16 @@ def not_stray(xyz: np.ndarray, key: np.ndarray, *, side: float, neighbours: int,
     return distance <= distance.mean(dtype=np.float64) + max_deviation * distance.std(dtype=np.float64)
 
 
-@njit(cache=True, nogil=True)
-def _index_cells(key, slot_row, row_key):
+@kernel
+def _index_cells(key: i8[::1], slot_row: i4[::1], row_key: i8[::1]):
     for row in range(len(key)):
         find_or_add(slot_row, row_key, row, key[row])
 
 
-@njit(cache=True, nogil=True)
-def _mean_distances(xyz, first, slot_row, row_key, reach, around, nearest, distance):
+@kernel
+def _mean_distances(
+    xyz: f4[:, ::1], first: i8[::1], slot_row: i4[::1], row_key: i8[::1], reach: f4, around: i8[:, ::1], nearest: f4[::1], distance: f4[::1]
+):
     """Fill each point's mean distance to its nearest neighbours, those beyond `reach`, a cell's side, counted at `reach`.
 
     around (27, 5), nearest (neighbours,) : room to work in; the first holds the point rows and the place of each cell round about
@@ -90,7 +93,7 @@ def _mean_distances(xyz, first, slot_row, row_key, reach, around, nearest, dista
             distance[i] = total / np.float32(neighbours)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _gap(x, side, reach):
     """Give the distance along one axis from x, measured from the cell's lower face, to the cell beside it on that side."""
     if side < 0:

@@ -8,9 +8,9 @@ doi:10.1109/TSSC.1968.300136.
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
 from slamcli.errors import SlamError
+from slamcli.kernels import kernel
 from slamcli.schema import Grid
 
 HALF_DIAGONAL = 0.5 * 2.0**0.5
@@ -113,7 +113,7 @@ def _unreachable(grid: Grid, cost: np.ndarray, ends: list[tuple[int, int]], allo
     return f"no way leads from start to goal: {area[0]:.1f} m2 can be reached from the start, {area[1]:.1f} m2 from the goal; try {hint}"
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _pop(key, order, cell, size):
     """Take the first entry off a binary heap of `size` entries; its cell is left at cell[size - 1]."""
     size -= 1
@@ -134,7 +134,7 @@ def _pop(key, order, cell, size):
     cell[size] = first
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _push(key, order, cell, size, k, o, c):
     """Add an entry to a binary heap of `size` entries; `o` counts the pushes, so that among equal keys the oldest comes first."""
     i = size
@@ -147,7 +147,7 @@ def _push(key, order, cell, size, k, o, c):
     key[i], order[i], cell[i] = k, o, c
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _a_star(cost, start, goal, before):
     """Fill `before` (H W) with each reached cell's predecessor on its cheapest 8-connected path; returns whether the goal was reached.
 
@@ -193,7 +193,7 @@ def _a_star(cost, start, goal, before):
     return False
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _doubled(values):
     out = np.empty(2 * len(values), dtype=values.dtype)
     for i in range(len(values)):

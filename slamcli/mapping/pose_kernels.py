@@ -5,16 +5,17 @@ sensor gave none. All arrays are C-contiguous float64 unless said otherwise.
 """
 
 import numpy as np
-from numba import njit
+from numba import b1, f8, i8
 
 from slamcli.geometry.se3 import left_update
+from slamcli.kernels import kernel
 
 Z_MIN = 1e-2  # [m] a landmark nearer to the image plane than this, or behind it, has no projection
 CHI2_BEHIND = 1e6  # what such an observation costs: more than any that can be seen, yet finite
 DAMPING_START, DAMPING_MIN, DAMPING_MAX = 1e-4, 1e-9, 1e6
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+@kernel(error_model="numpy", fastmath={"contract"})
 def _reprojection2(T, p, ray, i, fx, fy):
     """Squared reprojection error [px^2] of point p[i] under pose T (3, 4) against ray[i]."""
     z = T[2, 0] * p[i, 0] + T[2, 1] * p[i, 1] + T[2, 2] * p[i, 2] + T[2, 3]
@@ -25,8 +26,22 @@ def _reprojection2(T, p, ray, i, fx, fy):
     return du * du + dv * dv
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
-def rank(T, T_back, p, ray, p_back, ray_back, is_two_way, fx, fy, threshold2, size, confidence, is_inlier):
+@kernel(error_model="numpy", fastmath={"contract"})
+def rank(
+    T: f8[:, :, ::1],
+    T_back: f8[:, :, ::1],
+    p: f8[:, ::1],
+    ray: f8[:, ::1],
+    p_back: f8[:, ::1],
+    ray_back: f8[:, ::1],
+    is_two_way: b1,
+    fx: f8,
+    fy: f8,
+    threshold2: f8[::1],
+    size: i8,
+    confidence: f8,
+    is_inlier: b1[::1],
+):
     """Find the best of the hypotheses T (M, 3, 4), one per round; write its inliers; return its number, -1 = none, and the rounds done.
 
     Point p[i] is to fall on ray[i] under T and, if is_two_way, p_back[i] on ray_back[i] under T_back. Hypotheses are ranked by the
@@ -66,7 +81,7 @@ def rank(T, T_back, p, ray, p_back, ray_back, is_two_way, fx, fy, threshold2, si
     return best, done
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+@kernel(error_model="numpy", fastmath={"contract"})
 def normal_equations(T, x_w, xy, depth, inv_px, inv_z, is_used, camera, chi2_px, chi2_depth, robust, chi2, H, b):
     """Accumulate H = sum w J^T J (upper triangle) and b = -sum w J^T r at pose T; write chi2 (N,); return the robust cost.
 
@@ -141,7 +156,7 @@ def normal_equations(T, x_w, xy, depth, inv_px, inv_z, is_used, camera, chi2_px,
     return cost
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+@kernel(error_model="numpy", fastmath={"contract"})
 def solve_damped(H, b, damping, L, out):
     """Solve (H + damping diag H) out = b for 6 unknowns by Cholesky from H's upper triangle; False if it is not positive definite."""
     for j in range(6):
@@ -170,8 +185,22 @@ def solve_damped(H, b, damping, L, out):
     return True
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
-def refine(T, x_w, xy, depth, inv_px, inv_z, camera, chi2_px, chi2_depth, robust, rounds, iterations, is_inlier):
+@kernel(error_model="numpy", fastmath={"contract"})
+def refine(
+    T: f8[:, ::1],
+    x_w: f8[:, ::1],
+    xy: f8[:, ::1],
+    depth: f8[::1],
+    inv_px: f8[::1],
+    inv_z: f8[::1],
+    camera: f8[::1],
+    chi2_px: f8,
+    chi2_depth: f8,
+    robust: b1,
+    rounds: i8,
+    iterations: i8,
+    is_inlier: b1[::1],
+):
     """Levenberg-Marquardt on T (4, 4), with the inliers (N,) found anew after each round, in place.
 
     Returns the pose, the upper triangle of its information (6, 6), the robust cost of the inliers, the iterations done.

@@ -3,10 +3,11 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
+from numba import f4, f8, i4, i8, u1, u8
 
 from slamcli.geometry.bits import hamming
 from slamcli.geometry.camera import Camera
+from slamcli.kernels import kernel
 
 CELL = 20  # px, side of the buckets that features are sorted into
 
@@ -91,25 +92,25 @@ def search(
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _search(
-    T_cw,
-    xyz,
-    lm_desc,
-    direction,
-    reach,
-    xy,
-    octave,
-    desc,
-    bucket_start,
-    bucket_rows,
-    intrinsics,
-    width,
-    height,
-    octave_scale,
-    radius_px,
-    max_distance,
-    ratio,
+    T_cw: f8[:, ::1],
+    xyz: f8[:, ::1],
+    lm_desc: u8[:, ::1],
+    direction: f8[:, ::1],
+    reach: f8[::1],
+    xy: f4[:, ::1],
+    octave: u1[::1],
+    desc: u8[:, ::1],
+    bucket_start: i4[::1],
+    bucket_rows: i4[::1],
+    intrinsics: f8[::1],
+    width: i8,
+    height: i8,
+    octave_scale: f8,
+    radius_px: f8,
+    max_distance: i8,
+    ratio: f8,
 ):
     n_lm, n = len(xyz), len(xy)
     feature = np.full(n_lm, -1, dtype=np.int32)

@@ -4,10 +4,11 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
+from numba import f4, f8, i4, i8, u1, u2
 
 from slamcli.config import GridConfig, SensorConfig
 from slamcli.errors import SlamError
+from slamcli.kernels import kernel
 
 SLICES = 16  # of the band's height, one bit each
 ALL_SLICES = (1 << SLICES) - 1
@@ -55,8 +56,24 @@ def look(depth: np.ndarray, rays: np.ndarray, T_lk: np.ndarray, *, settings: Gri
     )
 
 
-@njit(cache=True, nogil=True)
-def _sort_points(depth, rays, T, corner, stride, cell, near, far, low, high, noise_base, noise_quadratic, n_band, slices, floor):
+@kernel
+def _sort_points(
+    depth: f4[:, ::1],
+    rays: f4[:, :, ::1],
+    T: f8[:, ::1],
+    corner: f8[::1],
+    stride: i8,
+    cell: f8,
+    near: f8,
+    far: f8,
+    low: f8,
+    high: f8,
+    noise_base: f8,
+    noise_quadratic: f8,
+    n_band: i4[:, ::1],
+    slices: u2[:, ::1],
+    floor: u1[:, ::1],
+):
     """Count band points per cell and mark cells whose floor is seen or over which a line of sight passes below the band.
 
     Points closer to the floor than `low` plus twice their height's noise are the floor's; the noise of a height is the depth's noise

@@ -4,8 +4,9 @@ E. Rublee, V. Rabaud, K. Konolige, G. Bradski, ORB: an efficient alternative to 
 """
 
 import numpy as np
-from numba import int16, int32, njit, uint32, uintp
+from numba import f4, i4, int16, int32, u1, uint32, uintp
 
+from slamcli.kernels import kernel
 from slamcli.vision.pattern import PAIRS
 
 PATCH_RADIUS = 15  # [px] of the disc whose centroid gives the orientation
@@ -42,8 +43,8 @@ def _disc_mask() -> np.ndarray:
 _MASK = _disc_mask()
 
 
-@njit(cache=True, nogil=True)
-def orient(image, xy, mask, angle):
+@kernel
+def orient(image: u1[:, ::1], xy: i4[:, ::1], mask: u1[:, ::1], angle: f4[::1]):
     """Write each point's orientation [rad, -pi to pi]: the direction from the point to the centroid of the disc around it.
 
     image : (H, W) uint8; xy : (N, 2) int32, more than PATCH_RADIUS px inside; mask : the disc; angle : (N,) float32
@@ -71,8 +72,8 @@ def orient(image, xy, mask, angle):
         angle[k] = np.arctan2(np.float32(m01), np.float32(m10))
 
 
-@njit(cache=True, nogil=True)
-def describe(smooth, xy, angle, pair_x, pair_y, desc):
+@kernel
+def describe(smooth: u1[:, ::1], xy: i4[:, ::1], angle: f4[::1], pair_x: f4[:, ::1], pair_y: f4[:, ::1], desc: u1[:, ::1]):
     """Write the 256 comparisons of each point's turned test pattern as bits, lowest bit first.
 
     smooth : (H, W) uint8, blurred; xy : (N, 2) int32, at least BORDER px inside; pair_x, pair_y : (2, 256) float32, the first and the
@@ -96,7 +97,7 @@ def describe(smooth, xy, angle, pair_x, pair_y, desc):
             desc[k, byte] = value
 
 
-@njit(nogil=True)
+@kernel
 def _place(x, y, cos, sin, width):
     """Turn a test point and give its place in the flat image, relative to the key point; float32 is exact up to 2^24."""
     return ((x * sin + y * cos + ROUND) - ROUND) * width + ((x * cos - y * sin + ROUND) - ROUND)

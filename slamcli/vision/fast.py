@@ -6,24 +6,26 @@ E. Rosten, T. Drummond, Machine learning for high-speed corner detection, ECCV 2
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit, uint8, uint64
+from numba import b1, f8, i4, i8, u1, u8, uint8, uint64
+
+from slamcli.kernels import kernel
 
 RADIUS = 3  # [px] of the circle of 16 pixels
 FIT_RADIUS = 2  # [px] of the square of scores to which a parabola is fitted
 
 
-@njit(nogil=True)
+@kernel
 def _low(a, b):
     return a if a < b else b
 
 
-@njit(nogil=True)
+@kernel
 def _high(a, b):
     return a if a > b else b
 
 
-@njit(cache=True, nogil=True)
-def corner_score(image, margin, score):
+@kernel
+def corner_score(image: u1[:, ::1], margin: i8, score: u1[:, ::1]):
     """Write the FAST-9 score of every pixel: the largest t for which nine neighbours in a row on the circle differ by t or more.
 
     image, score : (H, W) uint8; the outer `margin` px, at least 3, score 0. A corner at threshold t is a pixel whose score is greater than t.
@@ -71,8 +73,8 @@ def corner_score(image, margin, score):
             out[x] = _high(uint8(_high(bright, c) - c), uint8(c - _low(dark, c)))
 
 
-@njit(cache=True, nogil=True)
-def local_maxima(score, margin, threshold, peak):
+@kernel
+def local_maxima(score: u1[:, ::1], margin: i8, threshold: i8, peak: u1[:, ::1]):
     """Keep the scores above the threshold that are the largest of their 3 x 3 neighbours; of equal ones the last in reading order.
 
     score : (H, W) uint8; peak : (H, >= W) uint8, 0 elsewhere; its outer `margin` rows, at least 1, are left as they are
@@ -91,8 +93,18 @@ def local_maxima(score, margin, threshold, peak):
             out[x + 1] = s if (s > least) & (s >= earlier) & (s > later) else uint8(0)
 
 
-@njit(cache=True, nogil=True)
-def collect(words, width, border, cell, xy, strength, cell_of, best, histogram):
+@kernel
+def collect(
+    words: u8[:, ::1],
+    width: i8,
+    border: i8,
+    cell: i8,
+    xy: i4[:, ::1],
+    strength: u1[::1],
+    cell_of: i4[::1],
+    best: u1[::1],
+    histogram: i4[::1],
+):
     """List the peaks at least `border` px inside, in reading order, with their scores and cells.
 
     words : (H, ceil(W / 8)) uint64, the peaks, eight pixels in one number: nearly all are 0 and skipped at once
@@ -122,8 +134,8 @@ def collect(words, width, border, cell, xy, strength, cell_of, best, histogram):
     return n
 
 
-@njit(cache=True, nogil=True)
-def keep(strength, cell_of, best, threshold, only_best, rows):
+@kernel
+def keep(strength: u1[::1], cell_of: i4[::1], best: u1[::1], threshold: i8, only_best: b1, rows: i4[::1]):
     """Choose corners cell by cell: those above the threshold; where a cell has none, all of it, or only the best (of equals the first).
 
     rows : (N,) int32, filled with the chosen; `best` is used up. Returns their number.
@@ -139,7 +151,7 @@ def keep(strength, cell_of, best, threshold, only_best, rows):
     return n
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def response(image, xy, out):
     """Write the response of each corner: the sum over the circle of |I_circle - I_centre|; [Z] (1). xy : (N, 2) int32, out : (N,) float32."""
     for k in range(len(xy)):
@@ -163,8 +175,8 @@ def _quadratic_fit() -> np.ndarray:
 _FIT = _quadratic_fit()
 
 
-@njit(cache=True, nogil=True)
-def summit(score, xy, fit, out):
+@kernel
+def summit(score: u1[:, ::1], xy: i4[:, ::1], fit: f8[:, ::1], out: f8[:, ::1]):
     """Write where the parabola through the 5 x 5 scores around each corner is highest, [px], at most 1 px from it on each axis."""
     for k in range(len(xy)):
         x, y = xy[k, 0], xy[k, 1]

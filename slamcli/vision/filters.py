@@ -1,22 +1,24 @@
 """Two small blurs in integer arithmetic: the same result on every machine, and faster than the general filters of OpenCV."""
 
 import numpy as np
-from numba import njit, uint8, uint16, uint32
+from numba import u1, uint8, uint16, uint32
+
+from slamcli.kernels import kernel
 
 # The 7-tap Gaussian of 2 px in 1/256, as OpenCV rounds it: outermost, ..., centre.
 G0, G1, G2, G3 = np.uint32(18), np.uint32(34), np.uint32(48), np.uint32(56)
 HALF = np.uint32(1 << 15)
 
 
-@njit(nogil=True)
+@kernel
 def _mirror(i, n):
     """Reflect an index that lies up to n - 1 outside 0 .. n - 1; the edge pixel is not repeated."""
     i = abs(i)
     return i if i < n else 2 * n - 2 - i
 
 
-@njit(cache=True, nogil=True)
-def gaussian_7(image, out):
+@kernel
+def gaussian_7(image: u1[:, ::1], out: u1[:, ::1]):
     """Blur with a Gaussian of 2 px, 7 x 7, mirrored at the edges. image, out : (H, W) uint8, H, W >= 4."""
     height, width = image.shape
     column = np.empty(width + 6, dtype=np.uint32)  # of vertical sums, three more at each end
@@ -36,8 +38,8 @@ def gaussian_7(image, out):
             row[x] = uint8(uint32(total + HALF) >> uint32(16))
 
 
-@njit(cache=True, nogil=True)
-def binomial_5(image, out):
+@kernel
+def binomial_5(image: u1[:, ::1], out: u1[:, ::1]):
     """Blur with the binomial 1 4 6 4 1 in both directions, a Gaussian of 1 px. (H, W) uint8, H, W >= 5; the outer 2 px become 0."""
     height, width = image.shape
     out[:2] = 0

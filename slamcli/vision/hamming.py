@@ -1,9 +1,10 @@
 """Matching of binary descriptors by Hamming distance: all with all, or only those under one vocabulary node."""
 
 import numpy as np
-from numba import njit, uint32
+from numba import f4, f8, i4, i8, u4, u8, uint32
 
 from slamcli.geometry.bits import popcount
+from slamcli.kernels import kernel
 
 BINS = 30  # of the histogram of turns between matched points
 KEPT_BINS = 3
@@ -16,8 +17,17 @@ NODE_RATIO = (
 Match = tuple[np.ndarray, np.ndarray]
 
 
-@njit(cache=True, nogil=True)
-def _compare(desc_i, block, desc_j, row_of_entry, back, best, following, choice):
+@kernel
+def _compare(
+    desc_i: u8[:, ::1],
+    block: i4[:, :, ::1],
+    desc_j: u8[:, ::1],
+    row_of_entry: i4[::1],
+    back: u4[::1],
+    best: i4[::1],
+    following: i4[::1],
+    choice: i4[::1],
+):
     """Keep for each row of i the smallest distance, whose it is, and the next smallest of another row; and for each entry of j the smallest.
 
     desc_i : (N, 4) uint64; block : (N, B, 2) int32, start and stop of the entries each row of i is compared with
@@ -55,8 +65,18 @@ def _compare(desc_i, block, desc_j, row_of_entry, back, best, following, choice)
         best[i], following[i], choice[i] = least >> shift, second, nearest
 
 
-@njit(cache=True, nogil=True)
-def _accept(best, following, choice, back, row_of_entry, back_of_row, max_distance, ratio, rows):
+@kernel
+def _accept(
+    best: i4[::1],
+    following: i4[::1],
+    choice: i4[::1],
+    back: u4[::1],
+    row_of_entry: i4[::1],
+    back_of_row: u4[::1],
+    max_distance: i8,
+    ratio: f8,
+    rows: i4[:, ::1],
+):
     """List the matches that pass distance and ratio and are each other's nearest.
 
     back_of_row : (M,) uint32 of the largest number, becomes `back` of the rows of j; rows : (N, 2) int32. Returns the number of matches.
@@ -73,8 +93,16 @@ def _accept(best, following, choice, back, row_of_entry, back_of_row, max_distan
     return n
 
 
-@njit(cache=True, nogil=True)
-def _group(node_i, node_j, desc_j, start, block, row_of_entry, entries):
+@kernel
+def _group(
+    node_i: i4[:, ::1],
+    node_j: i4[:, ::1],
+    desc_j: u8[:, ::1],
+    start: i4[::1],
+    block: i4[:, :, ::1],
+    row_of_entry: i4[::1],
+    entries: u8[:, ::1],
+):
     """Sort the rows of j by node, those whose first node it is before those whose second it is, and find each row of i its blocks.
 
     desc_j : (M, 4) uint64; start : (2 n_nodes + 1,) int32 of zeros; entries : (4, E) uint64, descriptors in the new order
@@ -147,8 +175,8 @@ def match_nodes(
     return _match(desc_i, block, entries, row_of_entry[:n], angle_i, angle_j, max_distance, ratio * NODE_RATIO, check_rotation)
 
 
-@njit(cache=True, nogil=True)
-def _keep_agreeing(rows, angle_i, angle_j):
+@kernel
+def _keep_agreeing(rows: i4[:, ::1], angle_i: f4[::1], angle_j: f4[::1]):
     """Keep in place the matches whose turn falls in the three fullest of thirty bins of a full circle; returns their number.
 
     A bin that holds less than a tenth of the fullest is left out; of equally full ones the first counts.

@@ -6,14 +6,14 @@ D. Arthur, S. Vassilvitskii, k-means++: the advantages of careful seeding, SODA 
 from collections.abc import Callable
 
 import numpy as np
-from numba import njit
 
 from slamcli.errors import SlamError
 from slamcli.geometry.bits import hamming
+from slamcli.kernels import kernel
 from slamcli.vision.vocabulary import MAX_NODES, Vocabulary, check, quantise
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _distances(desc, rows, centre, nearest_squared):
     """Lower each row's squared distance to the nearest centre by a new centre; returns the sum."""
     total = 0.0
@@ -24,7 +24,7 @@ def _distances(desc, rows, centre, nearest_squared):
     return total
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _assign(desc, rows, centres, label):
     """Label each row with its nearest centre, of equals the first; returns the number of labels that changed."""
     changed = 0
@@ -39,7 +39,7 @@ def _assign(desc, rows, centres, label):
     return changed
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _vote(desc, rows, label, centres):
     """Set each bit of each centre to the majority of its rows, an even vote to 1. A centre without rows stays."""
     votes = np.zeros((len(centres), 256), dtype=np.int32)

@@ -1,11 +1,13 @@
 """The quadtree that spreads key points over the image; [Z] 1.1, steps 4 to 7."""
 
 import numpy as np
-from numba import njit
+from numba import b1, f4, i4, i8
+
+from slamcli.kernels import kernel
 
 
-@njit(cache=True, nogil=True)
-def spread(xy, response, root, wanted, is_chosen):
+@kernel
+def spread(xy: i4[:, ::1], response: f4[::1], root: i4[::1], wanted: i8, is_chosen: b1[::1]):
     """Choose at most `wanted` points, evenly spread: one for each leaf of a quadtree.
 
     xy : (N, 2) int32 [px], no point twice; root : (4,) int32, x0, y0, x1, y1 of the first node, the end excluded; response : (N,) float32; is_chosen : (N,) bool, all false
@@ -52,7 +54,7 @@ def spread(xy, response, root, wanted, is_chosen):
         rank[weakest] = rank[n_nodes]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _fullest_first(start, stop, n_nodes, rank):
     """Sort nodes by falling number of points, equal ones by number, into rank: insertion, as there are a few hundred at most."""
     for node in range(n_nodes):
@@ -64,7 +66,7 @@ def _fullest_first(start, stop, n_nodes, rank):
         rank[place] = node
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _split(xy, order, buffer, box, start, stop, node, n_nodes):
     """Split a node in four in place; the first child that has points takes its row, the others are appended. Returns the number of nodes."""
     x0, y0, x1, y1 = box[node, 0], box[node, 1], box[node, 2], box[node, 3]
@@ -94,7 +96,7 @@ def _split(xy, order, buffer, box, start, stop, node, n_nodes):
     return n_nodes - 1  # the last target was not used
 
 
-@njit(nogil=True)
+@kernel
 def _child(xy, row, x_mid, y_mid):
     return (xy[row, 0] >= x_mid) + 2 * (xy[row, 1] >= y_mid)
 

@@ -9,10 +9,11 @@ from functools import cached_property, lru_cache
 from pathlib import Path
 
 import numpy as np
-from numba import njit
+from numba import f4, f8, i4, i8, u8
 
 from slamcli.errors import SlamError
 from slamcli.geometry.bits import hamming
+from slamcli.kernels import kernel
 
 FORMAT = 1
 MAX_NODES = 4_000_000  # ORB-SLAM's vocabulary has 1.1 million
@@ -168,8 +169,17 @@ def _read_arrays(path: Path) -> dict[str, np.ndarray]:
     return columns
 
 
-@njit(cache=True, nogil=True)
-def _descend(centre, first_child, word_of_node, desc, node_level, margin, word, node):
+@kernel
+def _descend(
+    centre: u8[:, ::1],
+    first_child: i4[::1],
+    word_of_node: i4[::1],
+    desc: u8[:, ::1],
+    node_level: i8,
+    margin: i8,
+    word: i4[::1],
+    node: i4[:, ::1],
+):
     """Walk each descriptor from the root to its word, at every step to the nearest child, of equals the first.
 
     node : (N, 2); the second is the next nearest child at `node_level`, -1 where it is more than `margin` bits farther.
@@ -226,8 +236,10 @@ def word_vectors(word: np.ndarray, offset: np.ndarray, idf: np.ndarray) -> tuple
     return bow_offset, np.concatenate([words for words, _ in vectors]), np.concatenate([weights for _, weights in vectors])
 
 
-@njit(cache=True, nogil=True)
-def _link(word, weight, frame, head, following, posting_frame, posting_weight, n):
+@kernel
+def _link(
+    word: i4[::1], weight: f4[::1], frame: i8, head: i4[::1], following: i4[::1], posting_frame: i4[::1], posting_weight: f4[::1], n: i8
+):
     for k in range(len(word)):
         posting_frame[n], posting_weight[n], following[n] = frame, weight[k], head[word[k]]
         head[word[k]] = n
@@ -235,8 +247,10 @@ def _link(word, weight, frame, head, following, posting_frame, posting_weight, n
     return n
 
 
-@njit(cache=True, nogil=True)
-def _score(word, weight, head, following, posting_frame, posting_weight, score):
+@kernel
+def _score(
+    word: i4[::1], weight: f4[::1], head: i4[::1], following: i4[::1], posting_frame: i4[::1], posting_weight: f4[::1], score: f8[::1]
+):
     for k in range(len(word)):
         posting = head[word[k]]
         while posting >= 0:

@@ -9,7 +9,8 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numba import njit
+
+from slamcli.kernels import kernel
 
 Painter = Callable[[np.random.Generator, float, float, float], np.ndarray]
 Colour = tuple[float, float, float]
@@ -72,7 +73,7 @@ def rectangle(image: np.ndarray, scale: float, x: float, y: float, w: float, h: 
     _fill(image, x * scale, y * scale, (x + w) * scale, (y + h) * scale, *map(float, colour))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _fill(image, left, top, right, bottom, red, green, blue):
     left, right = max(left, 0.0), min(right, float(image.shape[1]))
     top, bottom = max(top, 0.0), min(bottom, float(image.shape[0]))

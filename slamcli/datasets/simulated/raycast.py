@@ -6,11 +6,11 @@ Pixels on the border between two patches are cast four more times, so that edges
 from typing import Any
 
 import numpy as np
-from numba import njit
 
 from slamcli.datasets.simulated.atlas import bake_light, build_atlas
 from slamcli.datasets.simulated.scene import Patch, Scene
 from slamcli.geometry.camera import Camera
+from slamcli.kernels import kernel
 from slamcli.open3d_loader import load_open3d
 
 MAX_TAPS = 8  # of the anisotropic filter
@@ -115,7 +115,7 @@ def _border(seen: np.ndarray) -> np.ndarray:
     return border
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _pack_kernel(rays, T_lc):
     """Turn camera rays (N, 2) into Open3D's origin and direction, (N, 6) float32."""
     out = np.empty((len(rays), 6), np.float32)
@@ -127,7 +127,7 @@ def _pack_kernel(rays, T_lc):
     return out
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _spread_kernel(coarse, rows, columns):
     """Fill (rows, columns) from its every second row and column; -1 where the known pixels around an unknown one differ or are outside."""
     out = np.full((rows, columns), -1, np.int32)
@@ -145,7 +145,7 @@ def _spread_kernel(coarse, rows, columns):
     return out
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _depth_kernel(rays, seen, plane_c):
     """Intersect camera rays (N, 2) with the planes they see: depth along the optical axis and cosine of incidence."""
     depth = np.empty(len(rays), np.float32)
@@ -158,7 +158,7 @@ def _depth_kernel(rays, seen, plane_c):
     return depth, cosine
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _shade_kernel(rays, seen, pixel_x, pixel_y, plane_c, to_u_c, to_v_c, level, size, start, texel):
     """Sample the pictures under N camera rays (N, 2), a pixel being `pixel_x` x `pixel_y` wide in ray coordinates.
 
