@@ -56,7 +56,7 @@ def test_another_process_with_other_threads_and_hash_seed_gives_the_same_bytes(r
     assert digests(tmp_path / "again") == digests(room_run)
 
 
-@pytest.mark.parametrize("stage", ["extract", "track", "densify"])
+@pytest.mark.parametrize("stage", NAMES)
 def test_killed_for_real_in_a_stage_then_run_again_gives_the_same_bytes(room_run: Path, tmp_path: Path, stage: str) -> None:
     path = tmp_path / "run"
     shutil.copytree(room_run, path)
