@@ -1,16 +1,19 @@
 #!/usr/bin/env python
-"""Let the real ORB-SLAM3 load a vocabulary that slamcli exported, and track a recording with it.
+"""Track a recording with the real ORB-SLAM3 and a vocabulary that slamcli exported.
 
     slamcli vocab export words.txt
     pip install pyorbslam3 opencv-python-headless        (an environment of its own: it needs nothing of slamcli)
-    python scripts/orbslam3_vocabulary.py words.txt RUN
+    python scripts/orbslam3.py words.txt RUN [--out trajectory.txt]
 
-RUN is a run directory of slamcli: its extract/frames.txt and extract/camera.json say which images go together, and its run.json where they are.
+RUN is a run directory of slamcli: its extract/frames.txt and extract/camera.json say which images go together, and its run.json where
+they are. Frames are handed over at the pace of their stamps, as its own examples do, since mapping goes on in other threads meanwhile.
+The last line on standard output is a JSON object: frames, tracked, cpu_seconds and decode_cpu_seconds of the whole, wall seconds.
 """
 
 import argparse
 import json
 import tempfile
+import time
 from pathlib import Path
 
 import cv2
@@ -58,12 +61,28 @@ def as_decimals(camera: dict) -> dict:
     return {name: int(value) if name in ("width", "height") else f"{float(value):.9f}" for name, value in camera.items()}
 
 
+def track(slam, root: Path, lines: list[list[str]]) -> dict:
+    """Hand over every frame that has depth; give counts and times."""
+    n_tracked, decoding, points, start = 0, 0.0, [], time.perf_counter()
+    first = float(lines[0][0])
+    for stamp, colour, *depth in lines:
+        before = time.thread_time()
+        rgb = cv2.cvtColor(cv2.imread(str(root / colour)), cv2.COLOR_BGR2RGB)
+        raw = cv2.imread(str(root / depth[-1]), cv2.IMREAD_UNCHANGED) if len(depth) == 2 else np.zeros(rgb.shape[:2], np.uint16)
+        decoding += time.thread_time() - before
+        time.sleep(max(0.0, float(stamp) - first - (time.perf_counter() - start)))
+        result = slam.track_rgbd(rgb, raw, float(stamp))
+        n_tracked += bool(result.pose_valid)
+        points.append(result.num_tracked_points)
+    return {"frames": len(lines), "tracked": n_tracked, "points": float(np.median(points)), "decode_cpu_seconds": decoding}
+
+
 def main() -> None:
-    """Track the recording of a run and print how many frames ORB-SLAM3 gave a pose."""
+    """Track the recording of a run and print how many frames ORB-SLAM3 gave a pose, and what that cost."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("vocabulary", type=Path)
     parser.add_argument("run", type=Path)
-    parser.add_argument("--frames", type=int, default=0, help="how many frames; default: all")
+    parser.add_argument("--out", type=Path, help="where to write its final trajectory, in the TUM format")
     arguments = parser.parse_args()
     import pyorbslam3
 
@@ -74,15 +93,13 @@ def main() -> None:
         settings.write(SETTINGS.format(**as_decimals(camera)))
         settings.flush()
         slam = pyorbslam3.Slam(arguments.vocabulary, settings.name, pyorbslam3.Sensor.RGBD)
-        n_tracked, points = 0, []
-        for stamp, colour, _, depth in lines[: arguments.frames or None]:
-            rgb = cv2.cvtColor(cv2.imread(str(root / colour)), cv2.COLOR_BGR2RGB)
-            result = slam.track_rgbd(rgb, cv2.imread(str(root / depth), cv2.IMREAD_UNCHANGED), float(stamp))
-            n_tracked += bool(result.pose_valid)
-            points.append(result.num_tracked_points)
+        cpu, wall = time.process_time(), time.perf_counter()
+        found = track(slam, root, lines)
         slam.shutdown()
-    n = len(points)
-    print(f"{arguments.vocabulary}: ORB-SLAM3 tracked {n_tracked} of {n} frames, {np.median(points):.0f} map points a frame (median)")
+        found |= {"cpu_seconds": time.process_time() - cpu, "wall_seconds": time.perf_counter() - wall}
+        if arguments.out:
+            slam.save_trajectory_tum(str(arguments.out))
+    print(json.dumps(found))
 
 
 if __name__ == "__main__":
