@@ -86,6 +86,8 @@ class TrackConfig:
     search_ratio: float = option(0.8, "best against second best distance of the same octave", gt=0, le=1)
     local_key_frames: int = option(20, "key frames whose landmarks are looked for in a frame", ge=1)
     relocalise_candidates: int = option(5, "key frames tried after loss, best word score first", ge=1)
+    relocalise_inliers: int = option(45, "landmarks that must agree to recognise a place after loss; as for a closure", ge=4)
+    segment_after: int = option(10, "frames lost in a row, blank ones not counted, after which a new map segment begins; 0 = never", ge=0)
     key_frame_share: float = option(0.6, "a frame that holds less of its reference key frame's landmarks becomes one", gt=0, le=1)
     key_frame_gap: int = option(8, "frames between key frames at most", ge=1)
     share_key_frames: int = option(10, "neighbours in which a new key frame's landmarks are looked for", ge=0)
@@ -128,6 +130,8 @@ class LoopConfig:
     edges_per_key_frame: int = option(10, "such edges per key frame at most", ge=1)
     closure_spacing: int = option(10, "key frames around both ends of a closure within which no second one is looked for", ge=0)
     iterations: int = option(20, "rounds of each global bundle adjustment at most", ge=1)
+    join_closures: int = option(2, "closures that must agree on how two map segments lie before these are joined", ge=1)
+    main_segment: int = option(0, "map segment the maps are made of, where some could not be joined: 0 = the largest", ge=0)
     hindsight: bool = option(True, "match every frame again against the final map and refine it")
 
 

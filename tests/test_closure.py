@@ -104,7 +104,7 @@ def test_hindsight_finds_lost_frames_and_keeps_the_rest(turn):
     tracks.state[40:44], tracks.ref_kf[40:44] = LOST, -1
     tracks.T_kc[40:44] = np.nan
     builder = MapBuilder.from_map(scene.features, map_)
-    after = hindsight.refine_frames(builder, tracks, CAMERA, SENSOR, TrackConfig(), lambda items, label: items)
+    after = hindsight.refine_frames(builder, scene.features, tracks, CAMERA, SENSOR, TrackConfig(), lambda items, label: items)
     assert (after.state != LOST).all()
     error = [ape(frame_poses(t, map_), scene.T_gc) for t in (tracks, after)]
     assert 1e-4 < error[1] < error[0] + 0.001

@@ -59,7 +59,7 @@ def test_a_jump_out_of_the_known_is_lost_not_made_up():
     rng = np.random.default_rng(7)
     poses = np.concatenate([orbit(20, turns=0.05), orbit(20, turns=0.05) @ turn_about_y(np.pi)])
     scene = observe(poses, room_points(4000, rng), rng)
-    tracker = track(scene)
+    tracker = track(scene, segment_after=0)
     tracks = tracker.tracks()
     assert (tracks.state[:20] != LOST).all() and (tracks.state[20:] == LOST).all()
     assert "agree with the map" in tracker.lost_reason[25]

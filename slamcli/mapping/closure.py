@@ -8,8 +8,9 @@ from slamcli.config import LoopConfig, SensorConfig
 from slamcli.geometry import se3
 from slamcli.geometry.camera import Camera
 from slamcli.mapping import adjustment, pose, posegraph, projection
+from slamcli.mapping.localiser import estimate_pose, frame_features, word_vector
 from slamcli.mapping.mapbuilder import MapBuilder
-from slamcli.mapping.tracker import estimate_pose, frame_features, share_landmarks
+from slamcli.mapping.tracker import share_landmarks
 from slamcli.schema import Words
 from slamcli.vision import hamming, vocabulary
 
@@ -43,10 +44,8 @@ class Recogniser:
         self._index = vocabulary.InvertedIndex(len(words.idf))
         self._vectors = []
         for kf, frame in enumerate(kf_frame):
-            span = slice(int(words.bow_offset[frame]), int(words.bow_offset[frame + 1]))
-            vector = np.array(words.bow_word[span]), np.array(words.bow_weight[span])
-            self._vectors.append(vector)
-            self._index.add(kf, *vector)
+            self._vectors.append(word_vector(words, int(frame)))
+            self._index.add(kf, *self._vectors[kf])
 
     def scores(self, kf: int) -> np.ndarray:
         """Give the similarity (K,) of key frame `kf` to every key frame; [Z] (10)."""
@@ -164,7 +163,7 @@ def close(builder: MapBuilder, closures: list[Candidate], settings: LoopConfig) 
     """Spread the closures' corrections over the key frames; [L] (13). Closures that the rest of the graph contradicts are dropped."""
     graph = pose_graph(builder, closures, settings)
     is_fixed = np.zeros(len(builder.kf), dtype=bool)
-    is_fixed[0] = True
+    is_fixed[np.unique(builder.kf.segment, return_index=True)[1]] = True
     return posegraph.optimize(
         builder.kf.T_wk, graph.edge_kf, graph.edge_T_ij, graph.information, is_fixed=is_fixed, is_robust=graph.is_closure
     )
@@ -175,18 +174,28 @@ def is_near(a: Candidate, b: Candidate, *, span: int) -> bool:
     return abs(a.kf_i - b.kf_i) <= span and abs(a.kf_j - b.kf_j) <= span
 
 
+def spread(candidates: list[Candidate], *, span: int) -> list[Candidate]:
+    """Keep the first of those that claim the same revisit."""
+    kept: list[Candidate] = []
+    for c in candidates:
+        if not any(is_near(c, k, span=span) for k in kept):
+            kept.append(c)
+    return kept
+
+
 def reject(candidate: Candidate, reason: str) -> Candidate:
     """Give the candidate as rejected."""
     return replace(candidate, reason=reason)
 
 
 def covisibility_edges(builder: MapBuilder, settings: LoopConfig) -> tuple[np.ndarray, np.ndarray]:
-    """Give pairs of key frames (E, 2) that share landmarks, and how many; neighbours in time always belong."""
+    """Give pairs of key frames (E, 2) that share landmarks, and how many; neighbours in time within a segment always belong."""
     edges, weights = [], []
     for i in range(1, len(builder.kf)):
         shared = builder.votes(builder.landmarks_of(i))[:i]
         joined = np.flatnonzero(shared >= settings.edge_shared)
-        joined = np.union1d(joined[np.argsort(-shared[joined], kind="stable")[: settings.edges_per_key_frame]], [i - 1])
+        before = np.flatnonzero(builder.kf.segment[:i] == builder.kf.segment[i])[-1:]
+        joined = np.union1d(joined[np.argsort(-shared[joined], kind="stable")[: settings.edges_per_key_frame]], before)
         edges += [(i, int(j)) for j in joined]
         weights += [max(int(shared[j]), 1) for j in joined]
     return np.array(edges, dtype=np.int32).reshape(-1, 2), np.array(weights, dtype=np.float64)

@@ -11,7 +11,7 @@ import numpy as np
 
 from slamcli.geometry import se3
 from slamcli.geometry.camera import Camera
-from slamcli.schema import Features, Timing
+from slamcli.schema import Features, Map, Timing, Tracks, frame_poses
 
 REACH = 3  # frames on either side from which a frame's motion is read
 MAX_GAP = 0.15  # s, between a frame and those: over more the motion is not steady
@@ -42,6 +42,12 @@ def twists(stamp: np.ndarray, T_wc: np.ndarray) -> np.ndarray:
     spread = (dt * dt).sum(axis=1)
     slope = np.einsum("nk,nki->ni", dt, motion)
     return np.divide(slope, spread[:, None], out=np.zeros((n, 6)), where=spread[:, None] > 0.0)
+
+
+def frame_twists(stamp: np.ndarray, tracks: Tracks, map_: Map) -> np.ndarray:
+    """Give each frame's motion (F, 6) as `twists` does, each map segment for itself."""
+    segments = range(int(map_.kf_segment.max(initial=0)) + 1)
+    return np.sum([twists(stamp, frame_poses(tracks, map_, segment)) for segment in segments], axis=0)
 
 
 def velocity(xyz_c: np.ndarray, twist: np.ndarray) -> np.ndarray:
