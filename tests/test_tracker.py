@@ -94,3 +94,14 @@ def test_no_depth_anywhere_gives_no_map_and_says_why():
     tracker = track(scene)
     assert (tracker.tracks().state == LOST).all() and len(tracker.map().kf_frame) == 0
     assert "0 with depth" in tracker.lost_reason[4]
+
+
+def test_a_place_seen_again_and_again_stops_the_map_from_growing():
+    rng = np.random.default_rng(11)
+    there, n = sweep(20), 8
+    scene = observe(np.concatenate([there, there[::-1]] * n), room_points(3000, rng), rng)
+    bounded, endless = (track(scene, key_frame_views=views) for views in (6, 10**6))
+    assert (bounded.tracks().state != LOST).all()
+    grown = [np.count_nonzero(t.map().kf_frame >= 20 * n) for t in (bounded, endless)]
+    assert grown[0] < 0.4 * grown[1] and grown[1] >= 20 * n // 8
+    assert 1e-5 < ape(frame_poses(bounded.tracks(), bounded.map()), scene.T_gc) < 0.004

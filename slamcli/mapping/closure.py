@@ -15,6 +15,8 @@ from slamcli.schema import Words
 from slamcli.vision import hamming, vocabulary
 
 ODOMETRY_SIGMA = np.array([0.01, 0.01, 0.01, 0.005, 0.005, 0.005])  # [m, rad] between neighbours that share 100 landmarks
+AHEAD = 2.0  # [m] before the camera, what it looks at
+MIN_COSINE = 0.7  # between the directions of two views of one spot
 
 
 @dataclass(frozen=True)
@@ -29,6 +31,7 @@ class Candidate:
     reason: str = ""  # why it was rejected; empty = accepted
     T_ij: np.ndarray | None = None
     information: np.ndarray | None = None  # (6, 6) of T_ij, twist order
+    is_near: bool = False  # named by the poses of now, not by the words
 
     @property
     def is_accepted(self) -> bool:
@@ -75,6 +78,24 @@ def find_candidates(builder: MapBuilder, recogniser: Recogniser, settings: LoopC
     return sorted(candidates, key=lambda c: (-c.score, c.kf_i, c.kf_j))
 
 
+def find_near(builder: MapBuilder, recogniser: Recogniser, settings: LoopConfig) -> list[Candidate]:
+    """Give for each key frame the earlier one that looks at the same spot by the poses of now, yet shares (almost) no landmarks with it, nearest first.
+
+    Words miss such pairs when little of the two views is in common, as on either side of a gap, or when both are seen at an angle.
+    """
+    candidates = []
+    spot = builder.kf.T_wk[:, :3, 3] + AHEAD * builder.kf.T_wk[:, :3, 2]
+    for i in range(1, len(builder.kf)):
+        is_open = builder.votes(builder.landmarks_of(i))[:i] < settings.min_shared
+        is_open &= builder.kf.segment[:i] == builder.kf.segment[i]
+        is_open &= builder.kf.T_wk[:i, :3, 2] @ builder.kf.T_wk[i, :3, 2] > MIN_COSINE
+        apart = np.where(is_open, np.linalg.norm(spot[:i] - spot[i], axis=1), np.inf)
+        j = int(np.argmin(apart))
+        if apart[j] < settings.near:
+            candidates.append((float(apart[j]), Candidate(i, j, float(recogniser.scores(i)[j]), is_near=True)))
+    return [c for _, c in sorted(candidates, key=lambda pair: (pair[0], pair[1].kf_i))]
+
+
 def verify(
     builder: MapBuilder,
     words: Words,
@@ -84,10 +105,12 @@ def verify(
     sensor: SensorConfig,
     rng: np.random.Generator,
 ) -> Candidate:
-    """Check a candidate by geometry: 3-D to 3-D RANSAC, then the landmarks around j looked for in i."""
+    """Check a candidate by geometry: 3-D to 3-D RANSAC, for a near one the poses of now; then the landmarks around j looked for in i."""
     frame_i, frame_j = (
         frame_features(builder.features, int(builder.kf.frame[kf]), camera, sensor) for kf in (candidate.kf_i, candidate.kf_j)
     )
+    if candidate.is_near:
+        return _look_again(builder, candidate, frame_i, se3.inverse(builder.kf.T_wk[candidate.kf_i]), camera, settings)
     node_i, node_j = (np.array(words.node[f.first_row : f.first_row + len(f)]) for f in (frame_i, frame_j))
     rows, _ = hamming.match_nodes(frame_i.desc.view(np.uint8), node_i, frame_j.desc.view(np.uint8), node_j, frame_i.angle, frame_j.angle)
     has_depth = np.isfinite(frame_i.depth[rows[:, 0]]) & np.isfinite(frame_j.depth[rows[:, 1]])
@@ -109,9 +132,16 @@ def verify(
     )
     if start is None:
         return replace(candidate, reason="no rigid motion explains the matches")
+    T_iw = start.T_cw @ se3.inverse(builder.kf.T_wk[candidate.kf_j])
+    return _look_again(builder, candidate, frame_i, T_iw, camera, settings)
+
+
+def _look_again(
+    builder: MapBuilder, candidate: Candidate, frame_i: projection.FrameFeatures, T_iw: np.ndarray, camera: Camera, settings: LoopConfig
+) -> Candidate:
+    """Look for the landmarks around j in i, from a guess of its pose T_iw in the world that j stands in."""
     neighbours, _ = builder.covisible(candidate.kf_j)
     ids = builder.landmarks_in(np.append(neighbours[: settings.neighbours], candidate.kf_j))
-    T_iw = start.T_cw @ se3.inverse(builder.kf.T_wk[candidate.kf_j])
     landmarks = builder.candidates(ids)
     estimate = None
     for radius in (4.0, 2.0):

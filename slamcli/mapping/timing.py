@@ -16,6 +16,7 @@ from slamcli.schema import Features, Map, Timing, Tracks, frame_poses
 REACH = 3  # frames on either side from which a frame's motion is read
 MAX_GAP = 0.15  # s, between a frame and those: over more the motion is not steady
 FAR = 4.0  # m, depth assumed where none was read: there only the rotation moves a pixel noticeably
+ROWS_AT_ONCE = 1 << 18  # features rectified together: the intermediate results of a long recording would fill the memory
 LARGEST_GAP = 0.2  # [s] between neighbouring frames; over a longer one the motion is anybody's guess
 
 
@@ -55,11 +56,6 @@ def velocity(xyz_c: np.ndarray, twist: np.ndarray) -> np.ndarray:
     return -(twist[..., :3] + np.cross(twist[..., 3:], xyz_c))
 
 
-def frame_of_row(features: Features) -> np.ndarray:
-    """Give the frame (M,) of each feature row."""
-    return np.repeat(np.arange(len(features.stamp)), np.diff(features.offset))
-
-
 def flow(features: Features, twist: np.ndarray, camera: Camera, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Give what the camera's motion does to measurements, per second, and when in the readout they were made.
 
@@ -83,12 +79,15 @@ def depth_lag(features: Features, rows: np.ndarray) -> np.ndarray:
 
 def rectify(features: Features, timing: Timing, camera: Camera) -> Features:
     """Give the features as a camera would have measured them that takes the whole image, and its depth, at the colour stamp."""
-    rows = np.arange(len(features.xy))
-    px_per_s, depth_per_s, share = flow(features, timing.twist, camera, rows)
-    lag = depth_lag(features, rows) + float(timing.depth_delay)
-    xy = features.xy - px_per_s * (share * float(timing.readout))[:, None]
-    depth = features.depth - depth_per_s * lag
-    return replace(features, xy=xy.astype(np.float32), depth=np.where(depth > 0.0, depth, np.nan).astype(np.float32))
+    xy, depth = np.array(features.xy), np.array(features.depth)
+    for start in range(0, len(xy), ROWS_AT_ONCE):
+        rows = np.arange(start, min(start + ROWS_AT_ONCE, len(xy)))
+        px_per_s, depth_per_s, share = flow(features, timing.twist, camera, rows)
+        lag = depth_lag(features, rows) + float(timing.depth_delay)
+        xy[rows] -= px_per_s * (share * float(timing.readout))[:, None]
+        z = depth[rows] - depth_per_s * lag
+        depth[rows] = np.where(z > 0.0, z, np.nan)
+    return replace(features, xy=xy, depth=depth)
 
 
 def depth_poses(stamp: np.ndarray, depth_stamp: np.ndarray, T_wc: np.ndarray) -> np.ndarray:

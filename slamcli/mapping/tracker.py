@@ -87,6 +87,8 @@ class Tracker(Localiser):
         leaves_reference = tracked.sum() < self.settings.key_frame_share * n_reference
         meets_new_surface = (tracked & has_depth).sum() < 100 and (~tracked & has_depth).sum() > 70
         is_overdue = i - self.builder.kf.frame[-1] >= self.settings.key_frame_gap
+        if is_overdue:  # where many key frames see the same already, another would only make the map, and every later frame, dearer
+            is_overdue = np.median(self.builder.lm.n_obs[lm_of[tracked]]) < self.settings.key_frame_views
         return bool(leaves_reference or meets_new_surface or is_overdue)
 
     def _add_key_frame(self, i: int, frame: FrameFeatures, T_wc: np.ndarray, lm_of: np.ndarray) -> np.ndarray:

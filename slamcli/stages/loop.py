@@ -61,7 +61,8 @@ def close_loops(builder: MapBuilder, words: Words, camera, cfg, tools) -> list[C
     fate = join_segments(builder, recogniser, camera, cfg, rng)
     for _ in range(cfg.loop.rounds):
         new = []
-        for candidate in tools.progress(closure.find_candidates(builder, recogniser, cfg.loop), "loop"):
+        candidates = closure.find_candidates(builder, recogniser, cfg.loop) + closure.find_near(builder, recogniser, cfg.loop)
+        for candidate in tools.progress(candidates, "loop"):
             pair = (candidate.kf_i, candidate.kf_j)
             if are_apart(builder, candidate):
                 continue
