@@ -41,7 +41,8 @@ class MapBuilder:
 
     def add_key_frame(self, frame: int, T_wk: np.ndarray, segment: int = 0) -> int:
         """Add a key frame without observations; returns its row."""
-        return self.kf.append(1, frame=frame, segment=segment, T_wk=T_wk).start
+        # Its pose often comes from that of the key frame before, by products and inverses that double the rounding each time.
+        return self.kf.append(1, frame=frame, segment=segment, T_wk=se3.orthonormalise(T_wk)).start
 
     def add_landmarks(self, kf: int, rows: np.ndarray, xyz: np.ndarray) -> np.ndarray:
         """Create landmarks at `xyz` (N, 3) [m, world], each seen by key frame `kf` as feature `rows` (N,); returns their ids."""
