@@ -86,8 +86,11 @@ class TrackConfig:
     search_ratio: float = option(0.8, "best against second best distance of the same octave", gt=0, le=1)
     local_key_frames: int = option(20, "key frames whose landmarks are looked for in a frame", ge=1)
     relocalise_candidates: int = option(5, "key frames tried after loss, best word score first", ge=1)
+    relocalise_inliers: int = option(45, "landmarks that must agree to recognise a place after loss; as for a closure", ge=4)
+    segment_after: int = option(10, "frames lost in a row, blank ones not counted, after which a new map segment begins; 0 = never", ge=0)
     key_frame_share: float = option(0.6, "a frame that holds less of its reference key frame's landmarks becomes one", gt=0, le=1)
-    key_frame_gap: int = option(8, "frames between key frames at most", ge=1)
+    key_frame_gap: int = option(8, "frames between key frames at most, where the place is new", ge=1)
+    key_frame_views: int = option(25, "a place is known well once half its landmarks are seen by so many key frames", ge=1)
     share_key_frames: int = option(10, "neighbours in which a new key frame's landmarks are looked for", ge=0)
     share_max_distance: int = option(50, "descriptors that differ more are not one landmark [bits]", ge=1, le=256)
     window_key_frames: int = option(12, "key frames adjusted with each new one", ge=2)
@@ -116,6 +119,7 @@ class LoopConfig:
     score_share: float = option(
         0.6, "less similar pairs are candidates from this share of the mean score of a key frame's neighbours", ge=0, le=1
     )
+    near: float = option(0.7, "key frames that by their poses look at spots this near each other are candidates too; 0 = none [m]", ge=0)
     min_shared: int = option(15, "key frames that share as many landmarks are joined already", ge=1)
     min_matches: int = option(20, "matches under the same words that a candidate needs", ge=4)
     min_inliers: int = option(45, "landmarks found again that an accepted closure needs; [Z] 1.3", ge=6)
@@ -128,6 +132,8 @@ class LoopConfig:
     edges_per_key_frame: int = option(10, "such edges per key frame at most", ge=1)
     closure_spacing: int = option(10, "key frames around both ends of a closure within which no second one is looked for", ge=0)
     iterations: int = option(20, "rounds of each global bundle adjustment at most", ge=1)
+    join_closures: int = option(2, "closures that must agree on how two map segments lie before these are joined", ge=1)
+    main_segment: int = option(0, "map segment the maps are made of, where some could not be joined: 0 = the largest", ge=0)
     hindsight: bool = option(True, "match every frame again against the final map and refine it")
 
 

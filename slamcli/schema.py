@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-FORMAT = 1  # of everything a run directory holds; raised whenever an array changes its meaning
+FORMAT = 2  # of everything a run directory holds; raised whenever an array changes its meaning
 
 
 def array(dtype: str, shape: str, meaning: str) -> Any:
@@ -71,10 +71,15 @@ class Tracks:
 
 @dataclass(frozen=True)
 class Map:
-    """Key frames, landmarks and the observations that join them."""
+    """Key frames, landmarks and the observations that join them.
+
+    Where tracking was lost for good, a new segment begins. Each has a world of its own, and nothing joins two segments: key frames and
+    landmarks of one cannot be compared with those of another. Segment 0 is the one that most frames belong to.
+    """
 
     kf_frame: np.ndarray = array("i4", "K", "frame index, increasing")
-    T_wk: np.ndarray = array("f8", "K 4 4", "key frame's camera to world")
+    kf_segment: np.ndarray = array("i4", "K", "segment a key frame belongs to")
+    T_wk: np.ndarray = array("f8", "K 4 4", "key frame's camera to its segment's world")
     lm_xyz: np.ndarray = array("f8", "L 3", "m, world")
     obs_lm: np.ndarray = array("i4", "O", "sorted by (landmark, key frame), pairs unique")
     obs_kf: np.ndarray = array("i4", "O", "row in kf_frame")
@@ -132,16 +137,21 @@ class Trajectory:
     T_wc: np.ndarray = array("f8", "N 4 4", "camera to world")
 
 
-def frame_poses(tracks: Tracks, map_: Map) -> np.ndarray:
-    """Give T_wc (F, 4, 4) of every frame under the map's key-frame poses, NaN where lost."""
+def frame_segments(tracks: Tracks, map_: Map) -> np.ndarray:
+    """Give the map segment (F,) of every frame, -1 where lost."""
+    return np.where(tracks.ref_kf >= 0, map_.kf_segment[tracks.ref_kf], -1) if len(map_.kf_segment) else np.full_like(tracks.ref_kf, -1)
+
+
+def frame_poses(tracks: Tracks, map_: Map, segment: int = 0) -> np.ndarray:
+    """Give T_wc (F, 4, 4) of every frame of a map segment under its key-frame poses, NaN for the lost and for those of other segments."""
     T_wc = np.full((len(tracks.ref_kf), 4, 4), np.nan)
-    has_pose = tracks.ref_kf >= 0
-    T_wc[has_pose] = map_.T_wk[tracks.ref_kf[has_pose]] @ tracks.T_kc[has_pose]
+    is_here = frame_segments(tracks, map_) == segment
+    T_wc[is_here] = map_.T_wk[tracks.ref_kf[is_here]] @ tracks.T_kc[is_here]
     return T_wc
 
 
-def trajectory(stamp: np.ndarray, tracks: Tracks, map_: Map) -> Trajectory:
-    """Give the poses of the frames that have one."""
-    T_wc = frame_poses(tracks, map_)
+def trajectory(stamp: np.ndarray, tracks: Tracks, map_: Map, segment: int = 0) -> Trajectory:
+    """Give the poses of the frames of a map segment."""
+    T_wc = frame_poses(tracks, map_, segment)
     has_pose = np.isfinite(T_wc[:, 0, 0])
     return Trajectory(stamp=stamp[has_pose], T_wc=T_wc[has_pose])

@@ -140,7 +140,7 @@ def _tracks(T_wc: np.ndarray, kf_frame: np.ndarray, lost: np.ndarray) -> Tracks:
 def _map(T_wk: np.ndarray, kf_frame: np.ndarray) -> Map:
     empty = np.empty(0, np.int32)
     return Map(
-        kf_frame=kf_frame, T_wk=T_wk, lm_xyz=np.empty((0, 3)), obs_lm=empty, obs_kf=empty, obs_row=np.empty(0, np.int64)
+        kf_frame=kf_frame, kf_segment=np.zeros(len(kf_frame), np.int32), T_wk=T_wk, lm_xyz=np.empty((0, 3)), obs_lm=empty, obs_kf=empty, obs_row=np.empty(0, np.int64)
     )  # fmt: skip
 
 

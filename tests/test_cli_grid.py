@@ -170,7 +170,11 @@ class Inputs:
             Timing: Timing(np.array(0.0), np.array(0.0), np.zeros((n, 6))),
             Tracks: Tracks(np.where(lost, -1, np.arange(n)).astype(np.int32), T_kc, np.ones(n, np.uint8), np.full(n, 99, np.int32)),
             Map: Map(
-                np.arange(n, dtype=np.int32), T_wl @ T_lc, np.empty((0, 3)), *(np.empty(0, t) for t in (np.int32, np.int32, np.int64))
+                np.arange(n, dtype=np.int32),
+                np.zeros(n, np.int32),
+                T_wl @ T_lc,
+                np.empty((0, 3)),
+                *(np.empty(0, t) for t in (np.int32, np.int32, np.int64)),
             ),
         }
         self.dataset, self._folder = Recording(T_lc), folder

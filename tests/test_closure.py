@@ -104,7 +104,34 @@ def test_hindsight_finds_lost_frames_and_keeps_the_rest(turn):
     tracks.state[40:44], tracks.ref_kf[40:44] = LOST, -1
     tracks.T_kc[40:44] = np.nan
     builder = MapBuilder.from_map(scene.features, map_)
-    after = hindsight.refine_frames(builder, tracks, CAMERA, SENSOR, TrackConfig(), lambda items, label: items)
+    after = hindsight.refine_frames(builder, scene.features, tracks, CAMERA, SENSOR, TrackConfig(), lambda items, label: items)
     assert (after.state != LOST).all()
     error = [ape(frame_poses(t, map_), scene.T_gc) for t in (tracks, after)]
     assert 1e-4 < error[1] < error[0] + 0.001
+
+
+def test_views_of_one_spot_are_found_by_their_poses(turn):
+    scene, _, map_ = turn
+    true = scene.T_gc[map_.kf_frame]
+    builder = drifted(scene, map_, np.array([0.001, 0.0, 0.0, 0.0, 0.0003, 0.0]))
+    recogniser = closure.Recogniser(scene.words, builder.kf.frame)
+    near = closure.find_near(builder, recogniser, SETTINGS)
+    spot = builder.kf.T_wk[:, :3, 3] + closure.AHEAD * builder.kf.T_wk[:, :3, 2]
+    for c in near:
+        assert c.is_near and c.kf_j < c.kf_i and np.linalg.norm(spot[c.kf_i] - spot[c.kf_j]) < SETTINGS.near
+        assert builder.votes(builder.landmarks_of(c.kf_i))[c.kf_j] < SETTINGS.min_shared
+    fate = [closure.verify(builder, scene.words, c, CAMERA, SETTINGS, SENSOR, np.random.default_rng(0)) for c in near]
+    accepted = [c for c in fate if c.is_accepted]
+    assert any(c.kf_i > 0.9 * len(true) and c.kf_j < 0.15 * len(true) for c in accepted)
+    for c in accepted:
+        error = se3.log(se3.inverse(se3.inverse(true[c.kf_i]) @ true[c.kf_j]) @ c.T_ij)
+        assert np.linalg.norm(error[:3]) < 0.05 and np.linalg.norm(error[3:]) < 0.02
+    builder.kf.segment[len(true) // 2 :] = 1
+    half = len(true) // 2
+    assert all((c.kf_i < half) == (c.kf_j < half) for c in closure.find_near(builder, recogniser, SETTINGS))
+
+
+def test_no_spot_is_near_at_a_reach_of_zero(turn):
+    scene, _, map_ = turn
+    builder = MapBuilder.from_map(scene.features, map_)
+    assert closure.find_near(builder, closure.Recogniser(scene.words, builder.kf.frame), LoopConfig(near=0.0)) == []

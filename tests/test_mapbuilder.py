@@ -90,7 +90,7 @@ def test_snapshot_round_trip(scene):
     builder.remove_landmarks(np.arange(0, 40, 2, dtype=np.int32))
     before = builder.snapshot()
     after = MapBuilder.from_map(scene.features, before).snapshot()
-    for name in ("kf_frame", "T_wk", "lm_xyz", "obs_lm", "obs_kf", "obs_row"):
+    for name in ("kf_frame", "kf_segment", "T_wk", "lm_xyz", "obs_lm", "obs_kf", "obs_row"):
         np.testing.assert_array_equal(getattr(before, name), getattr(after, name))
     keys = list(zip(before.obs_lm.tolist(), before.obs_kf.tolist(), strict=True))
     assert keys == sorted(set(keys))

@@ -40,7 +40,7 @@ class Inputs:
         kf = np.arange(n, dtype=np.int32)[frames]
         self._records = {
             Features: SimpleNamespace(stamp=self.dataset.stamp, depth_stamp=self.dataset.depth_stamp),
-            Map: Map(kf, T_wc[kf], none.reshape(0, 3), none.astype("i4"), none.astype("i4"), none.astype("i8")),
+            Map: Map(kf, 0 * kf, T_wc[kf], none.reshape(0, 3), none.astype("i4"), none.astype("i4"), none.astype("i8")),
         }
         ref_kf = (np.arange(n, dtype=np.int32) // (frames.step or 1)).clip(max=len(kf) - 1)
         T_kc = se3.inverse(T_wc[kf])[ref_kf] @ T_wc

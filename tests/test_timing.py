@@ -1,6 +1,8 @@
 import numpy as np
+from scenes import CAMERA, observe, room_points, sweep
 
 from slamcli.geometry import se3
+from slamcli.mapping import timing
 from slamcli.mapping.timing import depth_poses
 
 RATE = np.array([0.3, -0.2, 0.1, 0.2, 0.4, -0.1])  # twist a second
@@ -31,3 +33,15 @@ def test_the_poses_given_are_not_changed() -> None:
     before = T_wc.copy()
     assert not np.array_equal(depth_poses(stamp, stamp + 0.01, T_wc), before)
     np.testing.assert_array_equal(T_wc, before)
+
+
+def test_features_are_rectified_the_same_in_small_portions(monkeypatch):
+    rng = np.random.default_rng(0)
+    scene = observe(sweep(6), room_points(2000, rng), rng)
+    when = timing.Timing(readout=np.array(0.02), depth_delay=np.array(0.01), twist=rng.normal(0, 0.5, (6, 6)))
+    whole = timing.rectify(scene.features, when, CAMERA)
+    assert np.abs(whole.xy - scene.features.xy).max() > 1.0 and np.nanmax(np.abs(whole.depth - scene.features.depth)) > 0.005
+    monkeypatch.setattr(timing, "ROWS_AT_ONCE", 100)
+    again = timing.rectify(scene.features, when, CAMERA)
+    np.testing.assert_array_equal(again.xy, whole.xy)
+    np.testing.assert_array_equal(again.depth, whole.depth)

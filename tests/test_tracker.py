@@ -59,7 +59,7 @@ def test_a_jump_out_of_the_known_is_lost_not_made_up():
     rng = np.random.default_rng(7)
     poses = np.concatenate([orbit(20, turns=0.05), orbit(20, turns=0.05) @ turn_about_y(np.pi)])
     scene = observe(poses, room_points(4000, rng), rng)
-    tracker = track(scene)
+    tracker = track(scene, segment_after=0)
     tracks = tracker.tracks()
     assert (tracks.state[:20] != LOST).all() and (tracks.state[20:] == LOST).all()
     assert "agree with the map" in tracker.lost_reason[25]
@@ -94,3 +94,22 @@ def test_no_depth_anywhere_gives_no_map_and_says_why():
     tracker = track(scene)
     assert (tracker.tracks().state == LOST).all() and len(tracker.map().kf_frame) == 0
     assert "0 with depth" in tracker.lost_reason[4]
+
+
+def test_a_place_seen_again_and_again_stops_the_map_from_growing():
+    rng = np.random.default_rng(11)
+    there, n = sweep(20), 8
+    scene = observe(np.concatenate([there, there[::-1]] * n), room_points(3000, rng), rng)
+    bounded, endless = (track(scene, key_frame_views=views) for views in (6, 10**6))
+    assert (bounded.tracks().state != LOST).all()
+    grown = [np.count_nonzero(t.map().kf_frame >= 20 * n) for t in (bounded, endless)]
+    assert grown[0] < 0.4 * grown[1] and grown[1] >= 20 * n // 8
+    assert 1e-5 < ape(frame_poses(bounded.tracks(), bounded.map()), scene.T_gc) < 0.004
+
+
+def test_rotations_stay_orthonormal_from_key_frame_to_key_frame():
+    rng = np.random.default_rng(12)
+    scene = observe(sweep(60), room_points(3000, rng), rng)
+    R = track(scene, key_frame_gap=1, key_frame_views=10**6).map().T_wk[:, :3, :3]
+    assert len(R) == 60
+    assert np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max() < 1e-12

@@ -56,7 +56,7 @@ class Part:
 def gather(builder: MapBuilder, moving: np.ndarray, sensor: SensorConfig) -> Part:
     """Gather the key frames `moving` and all they see; key frames outside that see the same are held fixed.
 
-    Where nothing outside sees the same, the oldest of `moving` is held, which fixes the gauge.
+    In a segment where none is held so, the oldest of `moving` is, which fixes the gauge.
     """
     ids = builder.landmarks_in(moving)
     is_single = builder.lm.n_obs[ids] < 2
@@ -64,8 +64,8 @@ def gather(builder: MapBuilder, moving: np.ndarray, sensor: SensorConfig) -> Par
     obs_lm, obs_kf, row = builder.observations_of(shared)
     kfs = np.union1d(moving, obs_kf)
     is_fixed = ~np.isin(kfs, moving)
-    if not is_fixed.any():
-        is_fixed[0] = True
+    segments, oldest = np.unique(builder.kf.segment[kfs], return_index=True)
+    is_fixed[oldest[~np.isin(segments, builder.kf.segment[kfs[is_fixed]])]] = True
     kf_index = np.searchsorted(kfs, obs_kf).astype(np.int32)
     return Part(kfs, is_fixed, shared, ids[is_single], kf_index, obs_lm, row, measure(builder.features, row, sensor))
 

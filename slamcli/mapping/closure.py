@@ -8,12 +8,15 @@ from slamcli.config import LoopConfig, SensorConfig
 from slamcli.geometry import se3
 from slamcli.geometry.camera import Camera
 from slamcli.mapping import adjustment, pose, posegraph, projection
+from slamcli.mapping.localiser import estimate_pose, frame_features, word_vector
 from slamcli.mapping.mapbuilder import MapBuilder
-from slamcli.mapping.tracker import estimate_pose, frame_features, share_landmarks
+from slamcli.mapping.tracker import share_landmarks
 from slamcli.schema import Words
 from slamcli.vision import hamming, vocabulary
 
 ODOMETRY_SIGMA = np.array([0.01, 0.01, 0.01, 0.005, 0.005, 0.005])  # [m, rad] between neighbours that share 100 landmarks
+AHEAD = 2.0  # [m] before the camera, what it looks at
+MIN_COSINE = 0.7  # between the directions of two views of one spot
 
 
 @dataclass(frozen=True)
@@ -28,6 +31,7 @@ class Candidate:
     reason: str = ""  # why it was rejected; empty = accepted
     T_ij: np.ndarray | None = None
     information: np.ndarray | None = None  # (6, 6) of T_ij, twist order
+    is_near: bool = False  # named by the poses of now, not by the words
 
     @property
     def is_accepted(self) -> bool:
@@ -43,10 +47,8 @@ class Recogniser:
         self._index = vocabulary.InvertedIndex(len(words.idf))
         self._vectors = []
         for kf, frame in enumerate(kf_frame):
-            span = slice(int(words.bow_offset[frame]), int(words.bow_offset[frame + 1]))
-            vector = np.array(words.bow_word[span]), np.array(words.bow_weight[span])
-            self._vectors.append(vector)
-            self._index.add(kf, *vector)
+            self._vectors.append(word_vector(words, int(frame)))
+            self._index.add(kf, *self._vectors[kf])
 
     def scores(self, kf: int) -> np.ndarray:
         """Give the similarity (K,) of key frame `kf` to every key frame; [Z] (10)."""
@@ -76,6 +78,24 @@ def find_candidates(builder: MapBuilder, recogniser: Recogniser, settings: LoopC
     return sorted(candidates, key=lambda c: (-c.score, c.kf_i, c.kf_j))
 
 
+def find_near(builder: MapBuilder, recogniser: Recogniser, settings: LoopConfig) -> list[Candidate]:
+    """Give for each key frame the earlier one that looks at the same spot by the poses of now, yet shares (almost) no landmarks with it, nearest first.
+
+    Words miss such pairs when little of the two views is in common, as on either side of a gap, or when both are seen at an angle.
+    """
+    candidates = []
+    spot = builder.kf.T_wk[:, :3, 3] + AHEAD * builder.kf.T_wk[:, :3, 2]
+    for i in range(1, len(builder.kf)):
+        is_open = builder.votes(builder.landmarks_of(i))[:i] < settings.min_shared
+        is_open &= builder.kf.segment[:i] == builder.kf.segment[i]
+        is_open &= builder.kf.T_wk[:i, :3, 2] @ builder.kf.T_wk[i, :3, 2] > MIN_COSINE
+        apart = np.where(is_open, np.linalg.norm(spot[:i] - spot[i], axis=1), np.inf)
+        j = int(np.argmin(apart))
+        if apart[j] < settings.near:
+            candidates.append((float(apart[j]), Candidate(i, j, float(recogniser.scores(i)[j]), is_near=True)))
+    return [c for _, c in sorted(candidates, key=lambda pair: (pair[0], pair[1].kf_i))]
+
+
 def verify(
     builder: MapBuilder,
     words: Words,
@@ -85,10 +105,12 @@ def verify(
     sensor: SensorConfig,
     rng: np.random.Generator,
 ) -> Candidate:
-    """Check a candidate by geometry: 3-D to 3-D RANSAC, then the landmarks around j looked for in i."""
+    """Check a candidate by geometry: 3-D to 3-D RANSAC, for a near one the poses of now; then the landmarks around j looked for in i."""
     frame_i, frame_j = (
         frame_features(builder.features, int(builder.kf.frame[kf]), camera, sensor) for kf in (candidate.kf_i, candidate.kf_j)
     )
+    if candidate.is_near:
+        return _look_again(builder, candidate, frame_i, se3.inverse(builder.kf.T_wk[candidate.kf_i]), camera, settings)
     node_i, node_j = (np.array(words.node[f.first_row : f.first_row + len(f)]) for f in (frame_i, frame_j))
     rows, _ = hamming.match_nodes(frame_i.desc.view(np.uint8), node_i, frame_j.desc.view(np.uint8), node_j, frame_i.angle, frame_j.angle)
     has_depth = np.isfinite(frame_i.depth[rows[:, 0]]) & np.isfinite(frame_j.depth[rows[:, 1]])
@@ -110,9 +132,16 @@ def verify(
     )
     if start is None:
         return replace(candidate, reason="no rigid motion explains the matches")
+    T_iw = start.T_cw @ se3.inverse(builder.kf.T_wk[candidate.kf_j])
+    return _look_again(builder, candidate, frame_i, T_iw, camera, settings)
+
+
+def _look_again(
+    builder: MapBuilder, candidate: Candidate, frame_i: projection.FrameFeatures, T_iw: np.ndarray, camera: Camera, settings: LoopConfig
+) -> Candidate:
+    """Look for the landmarks around j in i, from a guess of its pose T_iw in the world that j stands in."""
     neighbours, _ = builder.covisible(candidate.kf_j)
     ids = builder.landmarks_in(np.append(neighbours[: settings.neighbours], candidate.kf_j))
-    T_iw = start.T_cw @ se3.inverse(builder.kf.T_wk[candidate.kf_j])
     landmarks = builder.candidates(ids)
     estimate = None
     for radius in (4.0, 2.0):
@@ -164,7 +193,7 @@ def close(builder: MapBuilder, closures: list[Candidate], settings: LoopConfig) 
     """Spread the closures' corrections over the key frames; [L] (13). Closures that the rest of the graph contradicts are dropped."""
     graph = pose_graph(builder, closures, settings)
     is_fixed = np.zeros(len(builder.kf), dtype=bool)
-    is_fixed[0] = True
+    is_fixed[np.unique(builder.kf.segment, return_index=True)[1]] = True
     return posegraph.optimize(
         builder.kf.T_wk, graph.edge_kf, graph.edge_T_ij, graph.information, is_fixed=is_fixed, is_robust=graph.is_closure
     )
@@ -175,18 +204,28 @@ def is_near(a: Candidate, b: Candidate, *, span: int) -> bool:
     return abs(a.kf_i - b.kf_i) <= span and abs(a.kf_j - b.kf_j) <= span
 
 
+def spread(candidates: list[Candidate], *, span: int) -> list[Candidate]:
+    """Keep the first of those that claim the same revisit."""
+    kept: list[Candidate] = []
+    for c in candidates:
+        if not any(is_near(c, k, span=span) for k in kept):
+            kept.append(c)
+    return kept
+
+
 def reject(candidate: Candidate, reason: str) -> Candidate:
     """Give the candidate as rejected."""
     return replace(candidate, reason=reason)
 
 
 def covisibility_edges(builder: MapBuilder, settings: LoopConfig) -> tuple[np.ndarray, np.ndarray]:
-    """Give pairs of key frames (E, 2) that share landmarks, and how many; neighbours in time always belong."""
+    """Give pairs of key frames (E, 2) that share landmarks, and how many; neighbours in time within a segment always belong."""
     edges, weights = [], []
     for i in range(1, len(builder.kf)):
         shared = builder.votes(builder.landmarks_of(i))[:i]
         joined = np.flatnonzero(shared >= settings.edge_shared)
-        joined = np.union1d(joined[np.argsort(-shared[joined], kind="stable")[: settings.edges_per_key_frame]], [i - 1])
+        before = np.flatnonzero(builder.kf.segment[:i] == builder.kf.segment[i])[-1:]
+        joined = np.union1d(joined[np.argsort(-shared[joined], kind="stable")[: settings.edges_per_key_frame]], before)
         edges += [(i, int(j)) for j in joined]
         weights += [max(int(shared[j]), 1) for j in joined]
     return np.array(edges, dtype=np.int32).reshape(-1, 2), np.array(weights, dtype=np.float64)

@@ -6,20 +6,23 @@ from slamcli.config import SensorConfig, TrackConfig
 from slamcli.geometry import se3
 from slamcli.geometry.camera import Camera
 from slamcli.mapping import projection
+from slamcli.mapping.localiser import estimate_pose, frame_features
 from slamcli.mapping.mapbuilder import MapBuilder
-from slamcli.mapping.tracker import estimate_pose, frame_features
-from slamcli.schema import KEY_FRAME, LOST, RELOCALISED, Tracks, frame_poses
+from slamcli.schema import KEY_FRAME, LOST, RELOCALISED, Features, Tracks
 
 NEIGHBOURS = 20  # covisible key frames whose landmarks are looked for
 LOST_WIDENING = 8.0  # a lost frame's neighbour stands where a frame's fast turn leaves it, some tens of pixels off
 
 
-def refine_frames(builder: MapBuilder, tracks: Tracks, camera: Camera, sensor: SensorConfig, settings: TrackConfig, progress) -> Tracks:
+def refine_frames(
+    builder: MapBuilder, features: Features, tracks: Tracks, camera: Camera, sensor: SensorConfig, settings: TrackConfig, progress
+) -> Tracks:
     """Refine every frame that is no key frame against the landmarks around it; lost ones are tried from both sides.
 
+    features, tracks : of the frames, which may be of another recording than the map
     A frame keeps its pose where much fewer landmarks agree than before. Returns new Tracks.
     """
-    look = _Look(builder, tracks, camera, sensor, settings)
+    look = _Look(builder, features, tracks, camera, sensor, settings)
     n = len(tracks.state)
     for i in progress(range(n), "hindsight"):
         if tracks.state[i] not in (LOST, KEY_FRAME):
@@ -37,9 +40,11 @@ def refine_frames(builder: MapBuilder, tracks: Tracks, camera: Camera, sensor: S
 class _Look:
     """The second look at frames, and what it found."""
 
-    def __init__(self, builder: MapBuilder, tracks: Tracks, camera: Camera, sensor: SensorConfig, settings: TrackConfig) -> None:
-        self.builder, self.camera, self.sensor, self.settings = builder, camera, sensor, settings
-        self.T_wc = frame_poses(tracks, builder.snapshot())
+    def __init__(self, builder, features, tracks, camera, sensor, settings) -> None:
+        self.builder, self.features, self.camera, self.sensor, self.settings = builder, features, camera, sensor, settings
+        self.T_wc = np.full(tracks.T_kc.shape, np.nan)  # each in the world of its segment
+        has_pose = tracks.ref_kf >= 0
+        self.T_wc[has_pose] = builder.kf.T_wk[tracks.ref_kf[has_pose]] @ tracks.T_kc[has_pose]
         self.ref_kf, self.T_kc = tracks.ref_kf.copy(), tracks.T_kc.copy()
         self.state, self.n_inliers = tracks.state.copy(), tracks.n_inliers.copy()
         self._around: dict[int, tuple] = {}
@@ -50,7 +55,7 @@ class _Look:
         widening : of the search window, where `T_wc` is a guess
         """
         wanted = max(self.settings.min_inliers, int(self.n_inliers[i]) // 2)
-        frame, candidates = frame_features(self.builder.features, i, self.camera, self.sensor), self._landmarks_around(kf)
+        frame, candidates = frame_features(self.features, i, self.camera, self.sensor), self._landmarks_around(kf)
         feature, _ = projection.search(
             se3.inverse(T_wc),
             candidates,

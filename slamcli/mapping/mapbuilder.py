@@ -23,7 +23,7 @@ class MapBuilder:
         self.desc = np.ascontiguousarray(features.desc).view(np.uint64)
         self.octave = np.ascontiguousarray(features.octave)
         self.octave_scale = float(features.octave_scale)
-        self.kf = Table(frame=("i4",), T_wk=("f8", 4, 4))
+        self.kf = Table(frame=("i4",), segment=("i4",), T_wk=("f8", 4, 4))
         self.lm = Table(
             xyz=("f8", 3),
             desc=("u8", 4),
@@ -40,9 +40,10 @@ class MapBuilder:
         self.obs = Table(lm=("i4",), kf=("i4",), row=("i8",), next=("i4",))
         self.lm_of_row = np.full(int(features.offset[-1]), -1, dtype=np.int32)
 
-    def add_key_frame(self, frame: int, T_wk: np.ndarray) -> int:
+    def add_key_frame(self, frame: int, T_wk: np.ndarray, segment: int = 0) -> int:
         """Add a key frame without observations; returns its row."""
-        return self.kf.append(1, frame=frame, T_wk=T_wk).start
+        # Its pose often comes from that of the key frame before, by products and inverses that double the rounding each time.
+        return self.kf.append(1, frame=frame, segment=segment, T_wk=se3.orthonormalise(T_wk)).start
 
     def add_landmarks(self, kf: int, rows: np.ndarray, xyz: np.ndarray) -> np.ndarray:
         """Create landmarks at `xyz` (N, 3) [m, world], each seen by key frame `kf` as feature `rows` (N,); returns their ids."""
@@ -171,6 +172,7 @@ class MapBuilder:
         which, kf, row = self.observations_of(ids)
         return Map(
             kf_frame=self.kf.frame.copy(),
+            kf_segment=self.kf.segment.copy(),
             T_wk=self.kf.T_wk.copy(),
             lm_xyz=self.lm.xyz[ids],
             obs_lm=which,
@@ -183,7 +185,7 @@ class MapBuilder:
         """Rebuild the growing form of a map."""
         self = cls(features)
         n_kf, n_lm = len(map_.kf_frame), len(map_.lm_xyz)
-        self.kf.append(n_kf, frame=map_.kf_frame, T_wk=map_.T_wk)
+        self.kf.append(n_kf, frame=map_.kf_frame, segment=map_.kf_segment, T_wk=map_.T_wk)
         first = np.searchsorted(map_.obs_lm, np.arange(n_lm))
         first_kf = map_.obs_kf[first] if n_lm else np.empty(0, np.int32)
         self.lm.append(

@@ -11,11 +11,12 @@ import numpy as np
 
 from slamcli.geometry import se3
 from slamcli.geometry.camera import Camera
-from slamcli.schema import Features, Timing
+from slamcli.schema import Features, Map, Timing, Tracks, frame_poses
 
 REACH = 3  # frames on either side from which a frame's motion is read
 MAX_GAP = 0.15  # s, between a frame and those: over more the motion is not steady
 FAR = 4.0  # m, depth assumed where none was read: there only the rotation moves a pixel noticeably
+ROWS_AT_ONCE = 1 << 18  # features rectified together: the intermediate results of a long recording would fill the memory
 LARGEST_GAP = 0.2  # [s] between neighbouring frames; over a longer one the motion is anybody's guess
 
 
@@ -44,14 +45,15 @@ def twists(stamp: np.ndarray, T_wc: np.ndarray) -> np.ndarray:
     return np.divide(slope, spread[:, None], out=np.zeros((n, 6)), where=spread[:, None] > 0.0)
 
 
+def frame_twists(stamp: np.ndarray, tracks: Tracks, map_: Map) -> np.ndarray:
+    """Give each frame's motion (F, 6) as `twists` does, each map segment for itself."""
+    segments = range(int(map_.kf_segment.max(initial=0)) + 1)
+    return np.sum([twists(stamp, frame_poses(tracks, map_, segment)) for segment in segments], axis=0)
+
+
 def velocity(xyz_c: np.ndarray, twist: np.ndarray) -> np.ndarray:
     """Give how fast resting points (N, 3) [m, camera] move in a camera that moves by `twist` (N, 6) or (6,); (N, 3) [m/s]."""
     return -(twist[..., :3] + np.cross(twist[..., 3:], xyz_c))
-
-
-def frame_of_row(features: Features) -> np.ndarray:
-    """Give the frame (M,) of each feature row."""
-    return np.repeat(np.arange(len(features.stamp)), np.diff(features.offset))
 
 
 def flow(features: Features, twist: np.ndarray, camera: Camera, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -77,12 +79,15 @@ def depth_lag(features: Features, rows: np.ndarray) -> np.ndarray:
 
 def rectify(features: Features, timing: Timing, camera: Camera) -> Features:
     """Give the features as a camera would have measured them that takes the whole image, and its depth, at the colour stamp."""
-    rows = np.arange(len(features.xy))
-    px_per_s, depth_per_s, share = flow(features, timing.twist, camera, rows)
-    lag = depth_lag(features, rows) + float(timing.depth_delay)
-    xy = features.xy - px_per_s * (share * float(timing.readout))[:, None]
-    depth = features.depth - depth_per_s * lag
-    return replace(features, xy=xy.astype(np.float32), depth=np.where(depth > 0.0, depth, np.nan).astype(np.float32))
+    xy, depth = np.array(features.xy), np.array(features.depth)
+    for start in range(0, len(xy), ROWS_AT_ONCE):
+        rows = np.arange(start, min(start + ROWS_AT_ONCE, len(xy)))
+        px_per_s, depth_per_s, share = flow(features, timing.twist, camera, rows)
+        lag = depth_lag(features, rows) + float(timing.depth_delay)
+        xy[rows] -= px_per_s * (share * float(timing.readout))[:, None]
+        z = depth[rows] - depth_per_s * lag
+        depth[rows] = np.where(z > 0.0, z, np.nan)
+    return replace(features, xy=xy, depth=depth)
 
 
 def depth_poses(stamp: np.ndarray, depth_stamp: np.ndarray, T_wc: np.ndarray) -> np.ndarray:

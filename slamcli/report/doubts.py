@@ -41,8 +41,15 @@ def remarks(content: Content) -> list[Remark]:
 
 def _poses(content: Content) -> list[Remark]:
     n, lost = len(content.stamp), int((content.state == LOST).sum())
-    if not lost:
-        return [Remark(GOOD, f"All {n} frames have a pose.")]
+    apart = n - lost - int(content.has_pose.sum())
+    if apart:
+        text = f"{apart} of {n} frames belong to map segments that could not be joined to the main one; no map shows what they saw."
+        return [Remark(BAD if apart > MANY * n else NOTE, text), *(_lost(content) if lost else [])]
+    return _lost(content) if lost else [Remark(GOOD, f"All {n} frames have a pose.")]
+
+
+def _lost(content: Content) -> list[Remark]:
+    n, lost = len(content.stamp), int((content.state == LOST).sum())
     spans = content.summary("track").get("lost_spans") or []
     where = "; ".join(
         f"{first} to {last}: {reason}" if last > first else f"{first}: {reason}" for first, last, reason in spans[:MOST_SPANS]

@@ -69,16 +69,17 @@ def _model(camera: Camera, option: DensifyConfig) -> Any:
 
 
 def depth_poses(inputs: Any, *, frames: str = "key") -> list[tuple[int, np.ndarray]]:
-    """Give frames' numbers and where the camera was, in the world frame, when their depth was measured.
+    """Give frames' numbers and where the camera was, in the world frame, when their depth was measured; of map segment 0 alone.
 
     inputs : what a stage gets, or a RunDir
     frames : "key" frames, or "all" that have a pose
     """
     features, map_, when = inputs.load(Features, "extract"), inputs.load(Map, "loop"), inputs.load(Timing, "loop")
     T_wc = frame_poses(inputs.load(Tracks, "loop"), map_)
-    T_wc[map_.kf_frame] = map_.T_wk
+    is_main = map_.kf_segment == 0
+    T_wc[map_.kf_frame[is_main]] = map_.T_wk[is_main]
     T_wd = timing.depth_poses(features.stamp, features.depth_stamp + float(when.depth_delay), T_wc)
-    chosen = map_.kf_frame if frames == "key" else np.flatnonzero(np.isfinite(T_wd[:, 0, 0]))
+    chosen = map_.kf_frame[is_main] if frames == "key" else np.flatnonzero(np.isfinite(T_wd[:, 0, 0]))
     return [(int(frame), T_wd[frame]) for frame in chosen]
 
 

@@ -7,15 +7,16 @@ from pathlib import Path
 import numpy as np
 
 from slamcli import artifacts
-from slamcli.mapping import adjustment, closure, hindsight, posegraph, timing
+from slamcli.errors import SlamError
+from slamcli.mapping import adjustment, closure, hindsight, posegraph, segments, timing
 from slamcli.mapping.closure import Candidate
 from slamcli.mapping.mapbuilder import MapBuilder
 from slamcli.schema import LOST, Closures, Features, Map, Timing, Tracks, Words
-from slamcli.stages.track import save_map_stage
+from slamcli.stages.track import save_map_stage, segment_file, segments_apart
 
 
 def run(inputs, out: Path, cfg, tools) -> dict:
-    """Close loops until no new one appears; then look at every frame again."""
+    """Join map segments and close loops until no new one appears; then look at every frame again."""
     words, tracks, camera = inputs.load(Words, "match"), inputs.load(Tracks, "optimize"), inputs.camera()
     when = inputs.load(Timing, "optimize")
     features = timing.rectify(inputs.load(Features, "extract"), when, camera)
@@ -25,10 +26,12 @@ def run(inputs, out: Path, cfg, tools) -> dict:
         tried = close_loops(builder, words, camera, cfg, tools)
     accepted = [c for c in tried if c.is_accepted]
     if accepted and cfg.loop.hindsight:
-        tracks = hindsight.refine_frames(builder, tracks, camera, cfg.sensor, cfg.track, tools.progress)
+        tracks = hindsight.refine_frames(builder, features, tracks, camera, cfg.sensor, cfg.track, tools.progress)
     write_pose_graph(out / "posegraph.g2o", builder, accepted, cfg.loop)
     write_candidates(out / "candidates.csv", tried)
-    map_ = builder.snapshot()
+    map_ = main_first(builder.snapshot(), tracks, cfg.loop.main_segment)
+    for segment, told in enumerate(segments_apart(tracks, map_), start=1):
+        tools.warn(f"{told}, could not be joined: their poses, in a frame of their own, are in {segment_file(segment)}; no map shows them")
     save_map_stage(out, features.stamp, tracks, map_)
     artifacts.save(tracks, out)
     artifacts.save(when, out)
@@ -37,21 +40,32 @@ def run(inputs, out: Path, cfg, tools) -> dict:
         "frames": len(features.stamp),
         "candidates": len(tried),
         "closures": len(accepted),
+        "segments": segments.n_segments(map_),
         "lost": int((tracks.state == LOST).sum()),
         "landmarks": len(map_.lm_xyz),
     }
 
 
+def main_first(map_: Map, tracks: Tracks, main: int) -> Map:
+    """Number the segments by size and make the one that was asked for the main one."""
+    n = max(1, segments.n_segments(map_))
+    if main >= n:
+        raise SlamError(f"loop.main_segment = {main}: the map has {n} segment{'s' * (n > 1)}; give a number below {n}")
+    return segments.ranked(map_, tracks, main)
+
+
 def close_loops(builder: MapBuilder, words: Words, camera, cfg, tools) -> list[Candidate]:
     """Search, verify, correct, fuse, adjust; again while that brings new closures. Returns all candidates with their fate."""
     recogniser = closure.Recogniser(words, builder.kf.frame)
-    kfs = np.arange(len(builder.kf), dtype=np.int32)
     rng = tools.rng()
-    fate: dict[tuple[int, int], Candidate] = {}
+    fate = join_segments(builder, recogniser, camera, cfg, rng)
     for _ in range(cfg.loop.rounds):
         new = []
-        for candidate in tools.progress(closure.find_candidates(builder, recogniser, cfg.loop), "loop"):
+        candidates = closure.find_candidates(builder, recogniser, cfg.loop) + closure.find_near(builder, recogniser, cfg.loop)
+        for candidate in tools.progress(candidates, "loop"):
             pair = (candidate.kf_i, candidate.kf_j)
+            if are_apart(builder, candidate):
+                continue
             done = [c for c in fate.values() if c.T_ij is not None]
             if any(closure.is_near(candidate, c, span=cfg.loop.closure_spacing) for c in done):
                 continue  # one closure joins its whole neighbourhood: fusion finds the rest
@@ -67,11 +81,40 @@ def close_loops(builder: MapBuilder, words: Words, camera, cfg, tools) -> list[C
         if not is_kept.any():
             break
         closure.apply(builder, graph.T_wk)
-        for c in itertools.compress(new, is_kept):
-            closure.fuse_around(builder, c, camera, cfg.loop, cfg.sensor)
-        builder.refresh(np.flatnonzero(builder.lm.is_alive).astype(np.int32))
-        adjustment.adjust(builder, kfs, camera, cfg.sensor, max_iterations=cfg.loop.iterations)
+        settle(builder, list(itertools.compress(new, is_kept)), camera, cfg)
     return [fate[key] for key in sorted(fate)]
+
+
+def settle(builder: MapBuilder, closures: list[Candidate], camera, cfg) -> None:
+    """Fuse what both sides of the closures see, and adjust the whole map."""
+    for c in closures:
+        closure.fuse_around(builder, c, camera, cfg.loop, cfg.sensor)
+    builder.refresh(np.flatnonzero(builder.lm.is_alive).astype(np.int32))
+    kfs = np.arange(len(builder.kf), dtype=np.int32)
+    adjustment.adjust(builder, kfs, camera, cfg.sensor, max_iterations=cfg.loop.iterations)
+
+
+def are_apart(builder: MapBuilder, c: Candidate) -> bool:
+    """Say whether the two key frames belong to different map segments."""
+    return bool(builder.kf.segment[c.kf_i] != builder.kf.segment[c.kf_j])
+
+
+def join_segments(builder: MapBuilder, recogniser, camera, cfg, rng) -> dict[tuple[int, int], Candidate]:
+    """Join map segments that saw the same place. Returns the fate of candidates between segments, by pair of key frames."""
+    if len(np.unique(builder.kf.segment)) < 2:
+        return {}
+    between = [c for c in closure.find_candidates(builder, recogniser, cfg.loop) if are_apart(builder, c)]
+    tried = [closure.verify(builder, recogniser.words, c, camera, cfg.loop, cfg.sensor, rng) for c in between]
+    fate = [c for c in tried if not c.is_accepted]
+    left = [c for c in tried if c.is_accepted]
+    while found := segments.find_join(builder, left, least=cfg.loop.join_closures):
+        segments.join(builder, found)
+        settle(builder, closure.spread(found.closures, span=cfg.loop.closure_spacing), camera, cfg)
+        fate += found.closures
+        # What says otherwise is tried again like any loop, now that odometry of a kind runs between the segments.
+        left = [c for c in left if are_apart(builder, c)]
+    alone = f"fewer than {cfg.loop.join_closures} closures agree on how the two map segments lie"
+    return {(c.kf_i, c.kf_j): c for c in (*fate, *(closure.reject(c, alone) for c in left))}
 
 
 def closures_of(accepted: list[Candidate]) -> Closures:

@@ -9,7 +9,7 @@ from slamcli import artifacts
 from slamcli.geometry.camera import Camera
 from slamcli.mapping import adjustment, hindsight, selfcalibration, timing
 from slamcli.mapping.mapbuilder import MapBuilder
-from slamcli.schema import Features, Map, Timing, Tracks, frame_poses
+from slamcli.schema import Features, Map, Timing, Tracks
 from slamcli.stages.track import save_map_stage
 
 
@@ -17,7 +17,7 @@ def run(inputs, out: Path, cfg, tools) -> dict:
     """Refine key frames, landmarks, timing and frames, without closures."""
     features, tracks, map_ = inputs.load(Features, "extract"), inputs.load(Tracks, "track"), inputs.load(Map, "track")
     camera = inputs.camera()
-    still = Timing(readout=np.array(0.0), depth_delay=np.array(0.0), twist=timing.twists(features.stamp, frame_poses(tracks, map_)))
+    still = Timing(readout=np.array(0.0), depth_delay=np.array(0.0), twist=timing.frame_twists(features.stamp, tracks, map_))
     when, sigma, summary = still, np.full(2, np.nan), {}
     if cfg.optimize.enabled and len(map_.kf_frame) > 1:
         builder = MapBuilder.from_map(features, map_)
@@ -51,10 +51,10 @@ def refine(
         if result is None or found is None:
             break
         when, sigma = found
-        when = replace(when, twist=timing.twists(features.stamp, frame_poses(tracks, builder.snapshot())))
+        when = replace(when, twist=timing.frame_twists(features.stamp, tracks, builder.snapshot()))
         cost.append(result.cost[-1])
     builder.features = timing.rectify(features, when, camera)
     result = adjustment.adjust(builder, kfs, camera, cfg.sensor, max_iterations=cfg.optimize.iterations)
-    tracks = hindsight.refine_frames(builder, tracks, camera, cfg.sensor, cfg.track, tools.progress)
+    tracks = hindsight.refine_frames(builder, builder.features, tracks, camera, cfg.sensor, cfg.track, tools.progress)
     summary = {} if result is None else {"cost": [*cost, result.cost[-1]], "outliers": int((~result.is_inlier).sum())}
     return tracks, when, sigma, summary

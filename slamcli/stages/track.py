@@ -7,8 +7,9 @@ import numpy as np
 
 from slamcli import artifacts
 from slamcli.formats import trajectory as trajectory_file
+from slamcli.mapping import segments
 from slamcli.mapping.tracker import Tracker
-from slamcli.schema import LOST, RELOCALISED, Features, Map, Matches, Tracks, Trajectory, Words, trajectory
+from slamcli.schema import LOST, RELOCALISED, Features, Map, Matches, Tracks, Trajectory, Words, frame_segments, trajectory
 
 
 def run(inputs, out: Path, cfg, tools) -> dict:
@@ -19,7 +20,8 @@ def run(inputs, out: Path, cfg, tools) -> dict:
     )
     for i in tools.progress(range(len(features.stamp)), "track"):
         tracker.process(i)
-    tracks, map_ = tracker.tracks(), tracker.map()
+    tracks = tracker.tracks()
+    map_ = segments.ranked(tracker.map(), tracks)
     lost = lost_spans(tracks.state, tracker.lost_reason)
     for first, last, reason in lost:
         tools.warn(f"frames {first} to {last} are lost: {reason}" if last > first else f"frame {first} is lost: {reason}")
@@ -30,6 +32,7 @@ def run(inputs, out: Path, cfg, tools) -> dict:
         "tracked": int((tracks.state != LOST).sum()),
         "lost": int((tracks.state == LOST).sum()),
         "relocalised": int((tracks.state == RELOCALISED).sum()),
+        "segments": segments.n_segments(map_),
         "key_frames": len(map_.kf_frame),
         "landmarks": len(map_.lm_xyz),
         "lost_spans": [list(span) for span in lost],
@@ -37,15 +40,37 @@ def run(inputs, out: Path, cfg, tools) -> dict:
 
 
 def save_map_stage(out: Path, stamp: np.ndarray, tracks: Tracks, map_: Map) -> None:
-    """Write what track, optimize and loop have in common: the map, the trajectory of all frames and that of the key frames."""
+    """Write what track, optimize and loop have in common: the map, the trajectory of all frames and that of the key frames.
+
+    Other map segments than the main one have a trajectory each, in a frame of its own.
+    """
     artifacts.save(map_, out)
     trajectory_file.write_tum(out / "trajectory.txt", trajectory(stamp, tracks, map_))
     trajectory_file.write_tum(out / "keyframes.txt", key_frame_trajectory(stamp, map_))
+    for segment in range(1, segments.n_segments(map_)):
+        trajectory_file.write_tum(out / segment_file(segment), trajectory(stamp, tracks, map_, segment))
+
+
+def segment_file(segment: int) -> str:
+    """Name the trajectory of a map segment that is not the main one."""
+    return f"trajectory_segment{segment}.txt"
 
 
 def key_frame_trajectory(stamp: np.ndarray, map_: Map) -> Trajectory:
-    """Give the poses of the key frames alone."""
-    return Trajectory(stamp=np.array(stamp[map_.kf_frame]), T_wc=map_.T_wk)
+    """Give the poses of the main segment's key frames alone."""
+    is_main = map_.kf_segment == 0
+    return Trajectory(stamp=np.array(stamp[map_.kf_frame[is_main]]), T_wc=map_.T_wk[is_main])
+
+
+def segments_apart(tracks: Tracks, map_: Map) -> list[str]:
+    """Tell which frames belong to other segments than the main one."""
+    frames, told = frame_segments(tracks, map_), []
+    for segment in range(1, segments.n_segments(map_)):
+        of = np.flatnonzero(frames == segment)
+        told.append(
+            f"map segment {segment}, {len(of)} of the frames {of[0]} to {of[-1]}" if len(of) else f"map segment {segment}, no frame"
+        )
+    return told
 
 
 def lost_spans(state: np.ndarray, reason: dict[int, str]) -> list[tuple[int, int, str]]:

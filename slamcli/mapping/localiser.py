@@ -1,0 +1,259 @@
+"""Find the poses of frames, one after the other, in a map that is already there."""
+
+import numpy as np
+
+from slamcli.config import SensorConfig, TrackConfig
+from slamcli.geometry import se3
+from slamcli.geometry.camera import Camera
+from slamcli.mapping import adjustment, pose, projection
+from slamcli.mapping.mapbuilder import MapBuilder
+from slamcli.mapping.pose import PoseEstimate
+from slamcli.mapping.projection import FrameFeatures
+from slamcli.schema import LOST, RELOCALISED, TRACKED, Features, Matches, Tracks, Words
+from slamcli.vision import hamming, vocabulary
+
+
+def frame_features(features: Features, frame: int, camera: Camera, sensor: SensorConfig) -> FrameFeatures:
+    """Gather the features of one frame with their noise."""
+    rows = slice(int(features.offset[frame]), int(features.offset[frame + 1]))
+    measured = adjustment.measure(features, rows, sensor)
+    xy = np.array(features.xy[rows])
+    bucket_start, bucket_rows = projection.sort_into_buckets(xy, camera)
+    return FrameFeatures(
+        xy=xy,
+        depth=measured.depth,
+        octave=np.array(features.octave[rows]),
+        angle=np.array(features.angle[rows]),
+        desc=np.array(features.desc[rows]).view(np.uint64),
+        sigma_px=measured.sigma_px,
+        sigma_z=measured.sigma_z,
+        first_row=rows.start,
+        bucket_start=bucket_start,
+        bucket_rows=bucket_rows,
+    )
+
+
+def estimate_pose(T_cw: np.ndarray, x_w: np.ndarray, frame: FrameFeatures, rows: np.ndarray, camera: Camera) -> PoseEstimate:
+    """Refine a pose on landmarks `x_w` (N, 3) seen as features `rows` (N,) of the frame."""
+    return pose.refine_pose(T_cw, x_w, frame.xy[rows], frame.depth[rows], frame.sigma_px[rows], frame.sigma_z[rows], camera)
+
+
+def word_vector(words: Words, frame: int) -> tuple[np.ndarray, np.ndarray]:
+    """Give the word vector of one frame: words (B,) and their weights (B,)."""
+    span = slice(int(words.bow_offset[frame]), int(words.bow_offset[frame + 1]))
+    return np.array(words.bow_word[span]), np.array(words.bow_weight[span])
+
+
+class Localiser:
+    """Finds the pose of one frame after the other: from the frame before it, else by recognising a key frame.
+
+    After `process` of every frame, `tracks()` gives the poses and `lost_reason` says why frames are lost.
+    """
+
+    def __init__(
+        self,
+        builder: MapBuilder,
+        map_words: Words,
+        features: Features,
+        words: Words,
+        matches: Matches,
+        camera: Camera,
+        settings: TrackConfig,
+        sensor: SensorConfig,
+        rng: np.random.Generator,
+    ):
+        """Take the map with the words of its features, and a recording's features, words and matches of neighbouring frames."""
+        self.builder, self.map_words = builder, map_words
+        self.features, self.words, self.matches = features, words, matches
+        self.camera, self.settings, self.sensor, self.rng = camera, settings, sensor, rng
+        self.octave_scale = float(features.octave_scale)
+        self.places = vocabulary.InvertedIndex(len(map_words.idf))
+        for kf, frame in enumerate(builder.kf.frame):
+            self.places.add(kf, *word_vector(map_words, int(frame)))
+        n = len(features.stamp)
+        self.ref_kf = np.full(n, -1, dtype=np.int32)
+        self.T_kc = np.full((n, 4, 4), np.nan)
+        self.state = np.full(n, LOST, dtype=np.uint8)
+        self.n_inliers = np.zeros(n, dtype=np.int32)
+        self.lost_reason: dict[int, str] = {}
+        self._pair_of = {(int(i), int(j)): p for p, (i, j) in enumerate(matches.pair)}
+        self._previous: FrameFeatures | None = None
+        self._lm_of_previous = np.empty(0, dtype=np.int32)  # landmark of each feature of the previous frame, -1 = none
+
+    def process(self, i: int) -> None:
+        """Find the pose of frame `i`; frames come in order."""
+        frame = frame_features(self.features, i, self.camera, self.sensor)
+        self._previous, self._lm_of_previous = frame, self._locate(i, frame)
+
+    def tracks(self) -> Tracks:
+        """Give the pose of every frame processed."""
+        return Tracks(ref_kf=self.ref_kf, T_kc=self.T_kc, state=self.state, n_inliers=self.n_inliers)
+
+    def pose_of(self, i: int) -> np.ndarray | None:
+        """Give T_wc (4, 4) of a frame under the map of now, None if lost."""
+        return None if self.ref_kf[i] < 0 else self.builder.kf.T_wk[self.ref_kf[i]] @ self.T_kc[i]
+
+    def segment_of(self, i: int) -> int:
+        """Give the map segment that frame `i` has its pose in, -1 if lost."""
+        return -1 if self.ref_kf[i] < 0 else int(self.builder.kf.segment[self.ref_kf[i]])
+
+    def _locate(self, i: int, frame: FrameFeatures) -> np.ndarray:
+        """Find the pose of frame `i`; returns the landmark of each of its features, none where it is lost."""
+        nothing = np.full(len(frame), -1, dtype=np.int32)
+        if len(frame) < self.settings.min_inliers:
+            self.lost_reason[i] = f"{len(frame)} features: blank or unreadable image"
+            return nothing
+        state = TRACKED
+        T_cw, ids = self._initial_pose(i, frame)
+        found = self._meet_local_map(frame, T_cw, ids, wanted=self.settings.min_inliers) if T_cw is not None else None
+        if found is None:
+            T_cw, ids = self._relocalise(i, frame)
+            found = self._meet_local_map(frame, T_cw, ids, wanted=self.settings.relocalise_inliers) if T_cw is not None else None
+            state = RELOCALISED
+        if found is None:
+            self.lost_reason[i] = f"fewer than {self.settings.min_inliers} of {len(frame)} features agree with the map"
+            return nothing
+        estimate, lm_of = found
+        self._record(i, estimate, lm_of, state)
+        return lm_of
+
+    def _record(self, i: int, estimate: PoseEstimate, lm_of: np.ndarray, state: int) -> None:
+        kf = int(np.argmax(self.builder.votes(lm_of[lm_of >= 0])))
+        self.ref_kf[i], self.state[i], self.n_inliers[i] = kf, state, estimate.n_inliers
+        self.T_kc[i] = se3.inverse(estimate.T_cw @ self.builder.kf.T_wk[kf])
+
+    def _initial_pose(self, i: int, frame: FrameFeatures) -> tuple[np.ndarray | None, np.ndarray]:
+        """Guess from the features matched to the previous frame, by P3P in RANSAC; else from the motion before it.
+
+        Matches need no motion model, so fast turns do no harm; [Z] 1.2.
+        """
+        T_wp = self.pose_of(i - 1) if i > 0 else None
+        if T_wp is None:
+            return None, np.empty(0, np.int32)
+        rows, x_w, ids = self._inherit(i, T_wp)
+        guesses = [self._predict(i, T_wp)]
+        if len(rows) >= self.settings.min_inliers:
+            start = pose.ransac_p3p(
+                x_w,
+                frame.xy[rows],
+                self.camera,
+                rng=self.rng,
+                rounds=self.settings.ransac_rounds,
+                threshold_px=self.settings.ransac_threshold_px,
+            )
+            if start is not None:
+                guesses.append(start.T_cw)
+            estimates = [estimate_pose(T_cw, x_w, frame, rows, self.camera) for T_cw in guesses]
+            best = max(estimates, key=lambda e: e.n_inliers)
+            if best.n_inliers >= self.settings.min_inliers:
+                return best.T_cw, self._known(i, ids[best.is_inlier])
+        return guesses[0], self._known(i, self._lm_of_previous)
+
+    def _known(self, i: int, ids: np.ndarray) -> np.ndarray:
+        """Give those of `ids` that still are landmarks; where none is, all that the key frame sees on which the frame before `i` hangs."""
+        ids = self.builder.resolve(ids)
+        ids = ids[ids >= 0]
+        return ids if len(ids) else self.builder.landmarks_of(self.ref_kf[i - 1])
+
+    def _inherit(self, i: int, T_wp: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Give features of frame `i` that match the previous frame: rows, points [m, world], landmark ids (-1: lifted by depth alone)."""
+        pair = self._pair_of.get((i, i - 1))
+        if pair is None:
+            return np.empty(0, np.int32), np.empty((0, 3)), np.empty(0, np.int32)
+        match = self.matches.row[self.matches.offset[pair] : self.matches.offset[pair + 1]]
+        previous = self._previous
+        ids = self.builder.resolve(self._lm_of_previous[match[:, 1]])
+        x_w = se3.transform(T_wp, self.camera.backproject(previous.xy[match[:, 1]], previous.depth[match[:, 1]]))
+        x_w[ids >= 0] = self.builder.lm.xyz[ids[ids >= 0]]
+        is_usable = np.isfinite(x_w[:, 0])
+        return match[is_usable, 0], x_w[is_usable], ids[is_usable]
+
+    def _predict(self, i: int, T_wp: np.ndarray) -> np.ndarray:
+        """Give T_cw of frame `i` under the motion between the two frames before it, scaled by the time between."""
+        T_wq = self.pose_of(i - 2) if i >= 2 else None
+        if T_wq is None or self.segment_of(i - 2) != self.segment_of(i - 1):
+            return se3.inverse(T_wp)
+        stamp = self.features.stamp
+        share = (stamp[i] - stamp[i - 2]) / (stamp[i - 1] - stamp[i - 2])
+        # A gap in the recording says nothing about the motion within it.
+        return se3.inverse(se3.interpolate(T_wq, T_wp, share if share < 4.0 else 1.0))
+
+    def _relocalise(self, i: int, frame: FrameFeatures) -> tuple[np.ndarray | None, np.ndarray]:
+        """Recognise a key frame by its words and find the pose in it; [Z] (10)."""
+        kfs, scores = self.places.query(*word_vector(self.words, i))
+        for kf in kfs[np.argsort(-scores, kind="stable")[: self.settings.relocalise_candidates]]:
+            ids = self.builder.lm_of_row[self.builder.rows_of(kf)]
+            place = self.builder.rows_of(kf)
+            here = slice(frame.first_row, frame.first_row + len(frame))
+            match, _ = hamming.match_nodes(
+                frame.desc.view(np.uint8),
+                self.words.node[here],
+                self.builder.features.desc[place],
+                self.map_words.node[place],
+                frame.angle,
+                self.builder.features.angle[place],
+            )
+            match = match[ids[match[:, 1]] >= 0]
+            if len(match) < self.settings.min_inliers:
+                continue
+            x_w = self.builder.lm.xyz[ids[match[:, 1]]]
+            start = pose.ransac_p3p(
+                x_w,
+                frame.xy[match[:, 0]],
+                self.camera,
+                rng=self.rng,
+                rounds=3 * self.settings.ransac_rounds,
+                threshold_px=self.settings.ransac_threshold_px,
+            )
+            if start is None:
+                continue
+            estimate = estimate_pose(start.T_cw, x_w, frame, match[:, 0], self.camera)
+            if estimate.n_inliers >= self.settings.min_inliers:
+                return estimate.T_cw, ids[match[estimate.is_inlier, 1]]
+        return None, np.empty(0, np.int32)
+
+    def _meet_local_map(
+        self, frame: FrameFeatures, T_cw: np.ndarray, ids: np.ndarray, *, wanted: int
+    ) -> tuple[PoseEstimate, np.ndarray] | None:
+        """Search the frame for all landmarks of the key frames around, and refine; None if fewer than `wanted` agree.
+
+        Associations are made anew from the landmarks' own descriptors: handed on from frame to frame they would creep.
+        """
+        local = self._local_landmarks(ids)
+        candidates = self.builder.candidates(local)
+        for radius in (self.settings.search_radius_px, 3.0 * self.settings.search_radius_px):
+            feature, is_visible = projection.search(
+                T_cw,
+                candidates,
+                frame,
+                self.camera,
+                octave_scale=self.octave_scale,
+                radius_px=radius,
+                max_distance=self.settings.search_max_distance,
+                ratio=self.settings.search_ratio,
+            )
+            which = np.flatnonzero(feature >= 0)
+            if len(which) >= 2 * self.settings.min_inliers:
+                break
+        if len(which) < wanted:
+            return None
+        estimate = estimate_pose(T_cw, candidates.xyz[which], frame, feature[which], self.camera)
+        if estimate.n_inliers < wanted:
+            return None
+        lm_of = np.full(len(frame), -1, dtype=np.int32)
+        agreed = which[estimate.is_inlier]
+        lm_of[feature[agreed]] = local[agreed]
+        self.builder.lm.n_visible[local[is_visible]] += 1
+        self.builder.lm.n_found[local[agreed]] += 1
+        return estimate, lm_of
+
+    def _local_landmarks(self, ids: np.ndarray) -> np.ndarray:
+        """Give the landmarks of the key frames that see most of `ids`, and of the neighbours of the first of these."""
+        votes = self.builder.votes(np.unique(ids))
+        order = np.argsort(-votes, kind="stable")
+        chosen = order[: min(self.settings.local_key_frames, np.count_nonzero(votes))]
+        if len(chosen) == 0:
+            return np.empty(0, dtype=np.int32)
+        neighbours, _ = self.builder.covisible(int(chosen[0]))
+        chosen = np.union1d(chosen, neighbours[: self.settings.local_key_frames // 2])
+        return self.builder.landmarks_in(chosen)

@@ -1,0 +1,75 @@
+"""Map segments, which begin where tracking was lost for good: which is the main one, and how two that saw the same place are joined."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from slamcli.geometry import se3
+from slamcli.mapping import closure
+from slamcli.mapping.closure import Candidate
+from slamcli.mapping.mapbuilder import MapBuilder
+from slamcli.schema import Map, Tracks, frame_segments
+
+AGREE_M, AGREE_RAD = 0.1, 0.05  # closures that differ by less agree on how two segments lie
+
+
+def ranked(map_: Map, tracks: Tracks, main: int = 0) -> Map:
+    """Number the segments by their frames, most first and of equals the earlier; then the one numbered `main` becomes 0."""
+    n = n_segments(map_)
+    frames = frame_segments(tracks, map_)
+    size = np.bincount(frames[frames >= 0], minlength=n)
+    order = np.argsort(-size, kind="stable")
+    order = np.concatenate([order[main : main + 1], np.delete(order, main)]) if main < n else order
+    return replace(map_, kf_segment=np.argsort(order)[map_.kf_segment].astype(np.int32))
+
+
+def n_segments(map_: Map) -> int:
+    """Give the number of segments."""
+    return int(map_.kf_segment.max(initial=-1)) + 1
+
+
+@dataclass(frozen=True)
+class Join:
+    """Two segments and the closures that agree on how they lie."""
+
+    a: int
+    b: int
+    T_ab: np.ndarray  # (4, 4) world of segment b to that of a
+    closures: list[Candidate]
+
+
+def find_join(builder: MapBuilder, closures: list[Candidate], *, least: int) -> Join | None:
+    """Find the two segments for which most closures agree on how they lie; None where fewer than `least` do.
+
+    One closure between segments stands alone: no odometry runs between them that could contradict it. So several have to say the same.
+    """
+    segment, best = builder.kf.segment, None
+    pairs = sorted({tuple(sorted((int(segment[c.kf_i]), int(segment[c.kf_j])))) for c in closures})
+    for a, b in ((a, b) for a, b in pairs if a != b):
+        here = [c for c in closures if {int(segment[c.kf_i]), int(segment[c.kf_j])} == {a, b}]
+        between = [c if segment[c.kf_i] == a else _turned(c) for c in here]
+        T_wi, T_wj, T_ij = (
+            np.array(T) for T in zip(*((builder.kf.T_wk[c.kf_i], builder.kf.T_wk[c.kf_j], c.T_ij) for c in between), strict=True)
+        )
+        T_ab = T_wi @ T_ij @ se3.inverse(T_wj)
+        # residual of closure n under the hypothesis of closure m, (m, n, 6)
+        e = se3.log(se3.inverse(T_wi) @ T_ab[:, None] @ T_wj @ se3.inverse(T_ij))
+        agrees = (np.linalg.norm(e[..., :3], axis=-1) < AGREE_M) & (np.linalg.norm(e[..., 3:], axis=-1) < AGREE_RAD)
+        m = int(np.argmax(agrees.sum(axis=1)))
+        if agrees[m].sum() >= max(least, 1 + (len(best.closures) if best else 0)):
+            best = Join(a, b, T_ab[m], [c for c, is_one in zip(here, agrees[m], strict=True) if is_one])
+    return best
+
+
+def _turned(c: Candidate) -> Candidate:
+    """Give a closure as seen from its other key frame."""
+    return replace(c, kf_i=c.kf_j, kf_j=c.kf_i, T_ij=se3.inverse(c.T_ij))
+
+
+def join(builder: MapBuilder, found: Join) -> None:
+    """Move segment b, with its landmarks, into the world of a."""
+    is_b = builder.kf.segment == found.b
+    T_wk = builder.kf.T_wk.copy()
+    T_wk[is_b] = found.T_ab @ T_wk[is_b]
+    closure.apply(builder, T_wk)
+    builder.kf.segment[is_b] = found.a

@@ -1,0 +1,189 @@
+"""Map segments: begun where tracking is lost for good, joined by places both saw, kept apart and told of otherwise."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scenes import CAMERA, ape, look_at, observe, room_points
+
+from slamcli import artifacts
+from slamcli.config import LoopConfig, OptimizeConfig, SensorConfig, TrackConfig
+from slamcli.errors import SlamError
+from slamcli.formats.trajectory import read_tum
+from slamcli.geometry import se3
+from slamcli.mapping import adjustment, segments
+from slamcli.mapping.closure import Candidate
+from slamcli.mapping.mapbuilder import MapBuilder
+from slamcli.schema import LOST, RELOCALISED, Features, Map, Matches, Tracks, Words, frame_poses, frame_segments, trajectory
+from slamcli.stages import loop, optimize, track
+
+SENSOR = SensorConfig(pixel_noise=0.5)
+
+
+class Run:
+    """The stages from track to loop on a scene, as the pipeline would call them."""
+
+    def __init__(self, scene, folder, **loop_settings):
+        self.scene, self.folder, self.warnings = scene, folder, []
+        self.cfg = SimpleNamespace(track=TrackConfig(), sensor=SENSOR, optimize=OptimizeConfig(), loop=LoopConfig(**loop_settings))
+        self.warn, self.summary = self.warnings.append, {}
+
+    def load(self, cls, stage):
+        given = {Features: self.scene.features, Words: self.scene.words, Matches: self.scene.matches}
+        return given[cls] if cls in given else artifacts.load(cls, self.folder / stage)
+
+    def camera(self):
+        return CAMERA
+
+    def rng(self):
+        return np.random.default_rng(0)
+
+    def progress(self, items, label, total=None):
+        return items
+
+    def stage(self, module):
+        name = module.__name__.split(".")[-1]
+        (self.folder / name).mkdir()
+        self.summary[name] = module.run(self, self.folder / name, self.cfg, self)
+
+    def result(self, stage):
+        return self.load(Tracks, stage), self.load(Map, stage)
+
+
+def on_circle(start: float, stop: float, n: int) -> np.ndarray:
+    """Look outward from a small circle, from one share of a turn to another."""
+    out = [np.array([np.cos(a), np.sin(a), 0.1 * np.sin(3 * a)]) for a in 2 * np.pi * np.linspace(start, stop, n)]
+    return np.array([look_at(0.8 * d * [1, 1, 0] + [0, 0, d[2]], 4.0 * d) for d in out])
+
+
+def scene_of(*arcs: tuple[float, float, int], seed: int = 0):
+    rng = np.random.default_rng(seed)
+    return observe(np.concatenate([on_circle(*arc) for arc in arcs]), room_points(9000, rng), rng)
+
+
+@pytest.fixture(scope="module")
+def apart(tmp_path_factory):
+    """A jump to the other side of the room and no way back: 60 frames, then 40."""
+    run = Run(scene_of((0.0, 0.4, 60), (0.62, 0.88, 40)), tmp_path_factory.mktemp("apart"))
+    for module in (track, optimize, loop):
+        run.stage(module)
+    return run
+
+
+def test_a_jump_into_the_unknown_begins_a_segment_after_the_frames_it_waits(apart):
+    tracks, map_ = apart.result("track")
+    expected = np.zeros(100, int)
+    expected[60:] = 1
+    expected[60 : 60 + TrackConfig().segment_after - 1] = -1
+    np.testing.assert_array_equal(frame_segments(tracks, map_), expected)
+    assert apart.summary["track"]["segments"] == 2
+
+
+def test_a_segment_never_joined_is_kept_in_its_own_frame_and_told_of(apart):
+    tracks, map_ = apart.result("loop")
+    assert apart.summary["loop"]["segments"] == 2 and apart.summary["loop"]["lost"] == 0  # hindsight found the frames waited for
+    for segment, frames in ((0, slice(0, 60)), (1, slice(60, 100))):
+        T_wc = frame_poses(tracks, map_, segment)
+        assert np.isfinite(T_wc[frames]).all() and np.isnan(np.delete(T_wc, np.r_[frames], axis=0)).all()
+        assert 1e-5 < ape(T_wc, apart.scene.T_gc) < 0.02
+    assert any("segment 1" in text and "60 to 99" in text and "trajectory_segment1.txt" in text for text in apart.warnings)
+
+
+def test_what_a_run_shows_is_the_main_segment(apart):
+    stamp = apart.scene.features.stamp
+    tracks, map_ = apart.result("loop")
+    np.testing.assert_allclose(read_tum(apart.folder / "loop/trajectory.txt").stamp, stamp[:60], atol=1e-6)
+    np.testing.assert_allclose(read_tum(apart.folder / "loop/trajectory_segment1.txt").stamp, stamp[60:], atol=1e-6)
+    assert len(trajectory(stamp, tracks, map_).stamp) == 60
+    assert read_tum(apart.folder / "loop/keyframes.txt").stamp.max() < stamp[60]
+
+
+def test_another_segment_can_be_asked_for(apart, tmp_path):
+    _, map_ = apart.result("optimize")
+    tracks = apart.load(Tracks, "optimize")
+    chosen = loop.main_first(map_, tracks, 1)
+    np.testing.assert_array_equal(chosen.kf_segment, 1 - map_.kf_segment)
+    with pytest.raises(SlamError, match="loop.main_segment = 2: the map has 2 segments"):
+        loop.main_first(map_, tracks, 2)
+
+
+def test_segments_that_saw_one_place_are_joined(tmp_path):
+    run = Run(scene_of((0.0, 0.3, 50), (0.6, 1.2, 90)), tmp_path)
+    for module in (track, optimize, loop):
+        run.stage(module)
+    assert run.summary["track"]["segments"] == 2 and run.summary["loop"]["segments"] == 1
+    tracks, map_ = run.result("loop")
+    assert (tracks.state != LOST).all() and not run.warnings[1:]
+    assert 1e-5 < ape(frame_poses(tracks, map_), run.scene.T_gc) < 0.015
+
+
+def test_a_place_known_from_an_earlier_segment_is_recognised(tmp_path):
+    run = Run(scene_of((0.0, 0.3, 40), (0.6, 0.8, 40), (0.1, 0.3, 40)), tmp_path)
+    run.stage(track)
+    tracks, map_ = run.result("track")
+    assert frame_segments(tracks, map_)[[0, 79, 80, 119]].tolist() == [0, 1, 0, 0]
+    assert tracks.state[80] in (RELOCALISED, 2) and run.summary["track"]["segments"] == 2
+
+
+def test_zero_never_begins_a_segment(tmp_path):
+    run = Run(scene_of((0.0, 0.2, 30), (0.6, 0.8, 30)), tmp_path)
+    run.cfg.track = TrackConfig(segment_after=0)
+    run.stage(track)
+    tracks, _ = run.result("track")
+    assert (tracks.state[:30] != LOST).all() and (tracks.state[30:] == LOST).all()
+    assert "frames 30 to 59 are lost: fewer than 15" in run.warnings[0]
+
+
+def two_segments(rng) -> tuple[MapBuilder, np.ndarray, np.ndarray]:
+    """Six key frames of one world; the last three say they stand in another."""
+    scene = scene_of((0.0, 0.2, 6))
+    builder = MapBuilder(scene.features)
+    T_ab = se3.exp(rng.normal(0, 1, 6))
+    for k, T in enumerate(scene.T_gc):
+        builder.add_key_frame(k, T if k < 3 else se3.inverse(T_ab) @ T, int(k >= 3))
+    return builder, scene.T_gc, T_ab
+
+
+def measured(T_gc, i, j, twist=None) -> Candidate:
+    T_ij = se3.inverse(T_gc[i]) @ T_gc[j]
+    return Candidate(i, j, 0.4, 100, 90, T_ij=T_ij if twist is None else se3.exp(np.array(twist)) @ T_ij)
+
+
+def test_closures_that_agree_join_and_the_one_that_does_not_is_left_out():
+    builder, T_gc, T_ab = two_segments(np.random.default_rng(1))
+    true = [measured(T_gc, 3, 1, [0.004, 0, 0, 0, 0.002, 0]), measured(T_gc, 4, 2), measured(T_gc, 5, 0)]
+    false = measured(T_gc, 5, 2, [0.5, 0, 0.2, 0, 0.3, 0])
+    found = segments.find_join(builder, [*true, false], least=2)
+    assert found.closures == true
+    np.testing.assert_allclose(found.T_ab, T_ab, atol=0.02)
+    segments.join(builder, found)
+    assert (builder.kf.segment == 0).all()
+    np.testing.assert_allclose(builder.kf.T_wk, T_gc, atol=0.03)
+
+
+def test_one_closure_alone_joins_nothing():
+    builder, T_gc, _ = two_segments(np.random.default_rng(2))
+    contradicting = [measured(T_gc, 3, 1), measured(T_gc, 4, 1, [0.3, 0, 0, 0, 0, 0]), measured(T_gc, 5, 1, [0, 0, 0, 0.2, 0, 0])]
+    assert segments.find_join(builder, contradicting, least=2) is None
+    assert segments.find_join(builder, contradicting, least=1) is not None
+
+
+def test_segments_are_numbered_by_their_frames():
+    none = np.empty(0, np.int32)
+    map_ = Map(
+        np.arange(4, dtype=np.int32), np.array([0, 1, 2, 1], np.int32), np.tile(np.eye(4), (4, 1, 1)), np.empty((0, 3)), none, none,
+        none.astype(np.int64),
+    )  # fmt: skip
+    ref_kf = np.array([0, 0, 1, 1, 3, 2, 2, -1], np.int32)
+    tracks = Tracks(ref_kf, np.tile(np.eye(4), (8, 1, 1)), np.ones(8, np.uint8), np.ones(8, np.int32))
+    assert segments.ranked(map_, tracks).kf_segment.tolist() == [1, 0, 2, 0]
+    assert segments.ranked(map_, tracks, main=2).kf_segment.tolist() == [2, 1, 0, 1]
+    assert frame_segments(tracks, map_).tolist() == [0, 0, 1, 1, 1, 2, 2, -1]
+
+
+def test_each_segment_has_its_gauge_fixed(apart):
+    _, map_ = apart.result("track")
+    builder = MapBuilder.from_map(apart.scene.features, map_)
+    part = adjustment.gather(builder, np.arange(len(builder.kf), dtype=np.int32), SENSOR)
+    first = [int(np.flatnonzero(map_.kf_segment == s)[0]) for s in (0, 1)]
+    np.testing.assert_array_equal(np.flatnonzero(part.is_fixed), first)
