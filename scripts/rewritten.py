@@ -58,6 +58,11 @@ def write(folder: Path, lists: Listed) -> Path:
     return folder
 
 
+def thinned(lists: Listed, offset: int, every: int) -> Listed:
+    """Leave out the first colour frames, and of the others all but every n-th."""
+    return replace(lists, colour=lists.colour[offset::every])
+
+
 def between(lists: Listed, start: float, stop: float) -> Listed:
     """Keep what lies between two times [s after the first colour image]."""
     return _kept(lists, lambda seconds: start <= seconds < stop)
