@@ -4,7 +4,7 @@ E. Rublee, V. Rabaud, K. Konolige, G. Bradski, ORB: an efficient alternative to 
 """
 
 import numpy as np
-from numba import f4, i4, int16, int32, u1, uint32, uintp
+from numba import f4, i4, i8, int16, int32, u1, u4, uint32, uintp
 
 from slamcli.kernels import kernel
 from slamcli.vision.pattern import PAIRS
@@ -14,7 +14,7 @@ BORDER = 19  # [px] the farthest a rotated test point reaches, ceil(13 sqrt 2)
 
 ROUND = np.float32(1.5 * 2**23)  # adding it leaves a float32 no digits after the point: x + ROUND - ROUND is x rounded, halves to even
 
-_PAIR_X, _PAIR_Y = (np.ascontiguousarray(PAIRS[:, :, axis].T, dtype=np.float32) for axis in (0, 1))
+_PAIR_X, _PAIR_Y = (PAIRS[:, :, axis].T.ravel().astype(np.float32) for axis in (0, 1))
 
 
 def _disc() -> np.ndarray:
@@ -44,7 +44,7 @@ _MASK = _disc_mask()
 
 
 @kernel
-def orient(image: u1[:, ::1], xy: i4[:, ::1], mask: u1[:, ::1], angle: f4[::1]):
+def _orient(image: u1[:, ::1], xy: i4[:, ::1], mask: u1[:, ::1], angle: f4[::1]):
     """Write each point's orientation [rad, -pi to pi]: the direction from the point to the centroid of the disc around it.
 
     image : (H, W) uint8; xy : (N, 2) int32, more than PATCH_RADIUS px inside; mask : the disc; angle : (N,) float32
@@ -73,45 +73,39 @@ def orient(image: u1[:, ::1], xy: i4[:, ::1], mask: u1[:, ::1], angle: f4[::1]):
 
 
 @kernel
-def describe(smooth: u1[:, ::1], xy: i4[:, ::1], angle: f4[::1], pair_x: f4[:, ::1], pair_y: f4[:, ::1], desc: u1[:, ::1]):
+def _describe(
+    smooth: u1[::1], width: i8, xy: i4[:, ::1], angle: f4[::1], pair_x: f4[::1], pair_y: f4[::1], place: u4[::1], desc: u1[:, ::1]
+):
     """Write the 256 comparisons of each point's turned test pattern as bits, lowest bit first.
 
-    smooth : (H, W) uint8, blurred; xy : (N, 2) int32, at least BORDER px inside; pair_x, pair_y : (2, 256) float32, the first and the
-    second points of the pairs; desc : (N, 32) uint8
+    smooth : (H W,) uint8, blurred; xy : (N, 2) int32, at least BORDER px inside
+    pair_x, pair_y : (512,) float32, the first points of the pairs, then the second; place : (512,) uint32, scratch; desc : (N, 32) uint8
     """
-    width = smooth.shape[1]
-    flat = smooth.ravel()
+    row = np.float32(width)  # float32 is exact up to 2^24
     corner = np.float32(BORDER * width + BORDER)  # keeps places positive: negative ones would be tested for and wrapped
-    a, b = np.empty(256, dtype=np.uint32), np.empty(256, dtype=np.uint32)
     for k in range(len(xy)):
         cos, sin = np.cos(angle[k]), np.sin(angle[k])
-        for p in range(256):
-            a[p] = uint32(_place(pair_x[0, p], pair_y[0, p], cos, sin, np.float32(width)) + corner)
-            b[p] = uint32(_place(pair_x[1, p], pair_y[1, p], cos, sin, np.float32(width)) + corner)
-        patch = flat[(xy[k, 1] - BORDER) * width + xy[k, 0] - BORDER :]
+        for p in range(512):
+            x, y = pair_x[p], pair_y[p]
+            place[p] = uint32(((x * sin + y * cos + ROUND) - ROUND) * row + ((x * cos - y * sin + ROUND) - ROUND) + corner)
+        start = uintp((xy[k, 1] - BORDER) * width + xy[k, 0] - BORDER)
         for byte in range(32):
             value = 0
             for bit in range(8):
                 p = 8 * byte + bit
-                value |= (patch[a[p]] < patch[b[p]]) << bit
+                value |= (smooth[start + place[p]] < smooth[start + place[p + 256]]) << bit
             desc[k, byte] = value
-
-
-@kernel
-def _place(x, y, cos, sin, width):
-    """Turn a test point and give its place in the flat image, relative to the key point; float32 is exact up to 2^24."""
-    return ((x * sin + y * cos + ROUND) - ROUND) * width + ((x * cos - y * sin + ROUND) - ROUND)
 
 
 def orientation(image: np.ndarray, xy: np.ndarray) -> np.ndarray:
     """Give the orientation (N,) float32 [rad] of points xy (N, 2) int32 of a grey image."""
     angle = np.empty(len(xy), dtype=np.float32)
-    orient(image, xy, _MASK, angle)
+    _orient(image, xy, _MASK, angle)
     return angle
 
 
 def descriptors(smooth: np.ndarray, xy: np.ndarray, angle: np.ndarray) -> np.ndarray:
     """Give the descriptors (N, 32) uint8 of points xy (N, 2) int32 with orientation angle (N,) [rad] of a blurred image."""
     desc = np.empty((len(xy), 32), dtype=np.uint8)
-    describe(smooth, xy, angle, _PAIR_X, _PAIR_Y, desc)
+    _describe(smooth.ravel(), smooth.shape[1], xy, angle, _PAIR_X, _PAIR_Y, np.empty(512, dtype=np.uint32), desc)
     return desc

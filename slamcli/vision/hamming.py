@@ -1,7 +1,7 @@
 """Matching of binary descriptors by Hamming distance: all with all, or only those under one vocabulary node."""
 
 import numpy as np
-from numba import f4, f8, i4, i8, u4, u8, uint32
+from numba import f4, f8, i4, i8, u4, u8, uint32, uintp
 
 from slamcli.geometry.bits import popcount
 from slamcli.kernels import kernel
@@ -44,24 +44,18 @@ def _compare(
         a0, a1, a2, a3 = desc_i[i, 0], desc_i[i, 1], desc_i[i, 2], desc_i[i, 3]
         least = uint32(0xFFFFFFFF)
         for b in range(block.shape[1]):
-            start, stop = block[i, b, 0], block[i, b, 1]
-            if start == stop:
-                continue
-            c0, c1, c2, c3, d, k = b0[start:stop], b1[start:stop], b2[start:stop], b3[start:stop], distance[start:stop], back[start:stop]
-            for e in range(stop - start):
-                bits = uint32(popcount(a0 ^ c0[e]) + popcount(a1 ^ c1[e]) + popcount(a2 ^ c2[e]) + popcount(a3 ^ c3[e]))
-                d[e] = bits
-                k[e] = min(k[e], uint32(uint32(bits << shift) | uint32(i)))
-                least = min(least, uint32(uint32(bits << shift) | uint32(start + e)))
+            for e in range(uintp(block[i, b, 0]), uintp(block[i, b, 1])):
+                bits = uint32(popcount(a0 ^ b0[e]) + popcount(a1 ^ b1[e]) + popcount(a2 ^ b2[e]) + popcount(a3 ^ b3[e]))
+                distance[e] = bits
+                back[e] = min(back[e], uint32(uint32(bits << shift) | uint32(i)))
+                least = min(least, uint32(uint32(bits << shift) | uint32(e)))
         if least == uint32(0xFFFFFFFF):
             best[i], following[i], choice[i] = FAR, FAR, -1
             continue
         nearest, second = row_of_entry[least & uint32((1 << INDEX_BITS) - 1)], uint32(FAR)
         for b in range(block.shape[1]):
-            start, stop = block[i, b, 0], block[i, b, 1]
-            d, rows = distance[start:stop], row_of_entry[start:stop]
-            for e in range(stop - start):
-                second = min(second, d[e] if rows[e] != nearest else uint32(FAR))
+            for e in range(uintp(block[i, b, 0]), uintp(block[i, b, 1])):
+                second = min(second, distance[e] if row_of_entry[e] != nearest else uint32(FAR))
         best[i], following[i], choice[i] = least >> shift, second, nearest
 
 
@@ -105,31 +99,30 @@ def _group(
 ):
     """Sort the rows of j by node, those whose first node it is before those whose second it is, and find each row of i its blocks.
 
-    desc_j : (M, 4) uint64; start : (2 n_nodes + 1,) int32 of zeros; entries : (4, E) uint64, descriptors in the new order
-    A counting sort; returns the number of entries.
+    node_i, node_j : (N, 2), (M, 2) int32; desc_j : (M, 4) uint64; start : (2 n_nodes + 2,) int32 of zeros; block : (N, 2, 2) int32 of zeros
+    entries : (4, E) uint64, descriptors in the new order. A counting sort; returns the number of entries.
     """
     for j in range(len(node_j)):
-        for c in range(node_j.shape[1]):
+        for c in range(2):
             if node_j[j, c] >= 0:
-                start[2 * node_j[j, c] + c + 1] += 1
+                start[2 * node_j[j, c] + c + 2] += 1
     for k in range(1, len(start)):
         start[k] += start[k - 1]
-    place = start.copy()
     for j in range(len(node_j)):
-        for c in range(node_j.shape[1]):
+        for c in range(2):
             if node_j[j, c] >= 0:
-                k = 2 * node_j[j, c] + c
-                e = place[k]
+                k = 2 * node_j[j, c] + c + 1
+                e = start[k]  # becomes the end of these entries, where the next begin
+                start[k] += 1
                 row_of_entry[e] = j
-                entries[0, e], entries[1, e], entries[2, e], entries[3, e] = desc_j[j, 0], desc_j[j, 1], desc_j[j, 2], desc_j[j, 3]
-                place[k] += 1
+                for w in range(4):
+                    entries[w, e] = desc_j[j, w]
     for i in range(len(node_i)):
-        first = 2 * node_i[i, 0]
+        first, second = 2 * node_i[i, 0], 2 * node_i[i, 1]
         block[i, 0, 0], block[i, 0, 1] = start[first], start[first + 2]
-        if node_i.shape[1] > 1 and node_i[i, 1] >= 0:
-            second = 2 * node_i[i, 1]
+        if second >= 0:
             block[i, 1, 0], block[i, 1, 1] = start[second], start[second + 1]
-    return start[len(start) - 1]
+    return start[-1]
 
 
 def as_words(desc: np.ndarray) -> np.ndarray:
@@ -163,16 +156,20 @@ def match_nodes(
     node : (N,) int32, or (N, 2) where the second is the node a descriptor nearly fell under, -1 for none. Then two are compared where
     one's first is the other's first or second. The ratio is tightened by NODE_RATIO.
     """
-    node_i, node_j = (
-        np.ascontiguousarray(node, dtype=np.int32).reshape(len(node), 1 if np.ndim(node) == 1 else 2) for node in (node_i, node_j)
-    )
+    node_i, node_j = _two_nodes(node_i), _two_nodes(node_j)
     if (len(node_i), len(node_j)) != (len(desc_i), len(desc_j)) or min(node_i[:, 0].min(initial=0), node_j[:, 0].min(initial=0)) < 0:
         raise ValueError("each descriptor needs a node")
     n_nodes = 1 + max(int(node_i.max(initial=0)), int(node_j.max(initial=0)))
-    block = np.zeros((len(node_i), node_i.shape[1], 2), dtype=np.int32)
+    block = np.zeros((len(node_i), 2, 2), dtype=np.int32)
     row_of_entry, entries = np.empty(node_j.size, dtype=np.int32), np.empty((4, node_j.size), dtype=np.uint64)
-    n = _group(node_i, node_j, as_words(desc_j), np.zeros(2 * n_nodes + 1, dtype=np.int32), block, row_of_entry, entries)
+    n = _group(node_i, node_j, as_words(desc_j), np.zeros(2 * n_nodes + 2, dtype=np.int32), block, row_of_entry, entries)
     return _match(desc_i, block, entries, row_of_entry[:n], angle_i, angle_j, max_distance, ratio * NODE_RATIO, check_rotation)
+
+
+def _two_nodes(node: np.ndarray) -> np.ndarray:
+    """Give nodes (N, 2) int32 from (N,) or (N, 2); -1 stands for no second."""
+    node = np.ascontiguousarray(node, dtype=np.int32)
+    return node if node.ndim == 2 else np.stack([node, np.full_like(node, -1)], axis=1)
 
 
 @kernel
