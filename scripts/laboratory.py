@@ -191,11 +191,13 @@ def draw_all(folder: Path, lab: Lab, plans: list[dict]) -> None:
     figures = {name: Figure(figsize=size) for name, size in (("fig7_band", (9, 7)), ("fig8_projection", (8, 7)), ("fig9_grids", (16, 8)))}
     axis = figures["fig7_band"].add_subplot(projection="3d")
     axis.scatter(*points[:: max(1, len(points) // 40000)].T, c=points[:: max(1, len(points) // 40000), 2], s=0.4, cmap="viridis")
-    axis.set_box_aspect(np.ptp(points, axis=0) * [1, 1, 3])
+    axis.set_box_aspect(np.ptp(points, axis=0) * [1, 1, 3], zoom=1.3)
+    axis.set(xlabel="x [m]", ylabel="y [m]", zticks=[config.band_low, config.band_high])
     axis.set_title(f"points from {config.band_low:g} to {config.band_high:g} m above the floor (heights threefold)")
     axis = figures["fig8_projection"].add_subplot()
     axis.plot(points[:, 0], points[:, 1], ",", color="#1a1a1a")
     axis.set_aspect("equal")
+    axis.set(xlabel="x [m]", ylabel="y [m]")
     axis.set_title("the same along the floor's normal")
     for k, (name, grid) in enumerate((("from the camera", lab.grid), (f"from a laser at {LASER_HEIGHT:g} m", lab.laser))):
         draw(figures["fig9_grids"].add_subplot(1, 2, k + 1), grid, trajectory=trajectory, title=name)
