@@ -11,6 +11,7 @@ OUT/seed<N> keeps recording, run and pictures; a recording or run that is there 
 """
 
 import argparse
+import itertools
 import json
 import subprocess
 import sys
@@ -36,6 +37,8 @@ PAPER = {"--speed": 0.15, "--turn-rate": 0.15, "--rate": 15, "--laps": 1.03, "--
 SENSOR = ("sensor.depth_min=1.2", "sensor.depth_max=3.5", "grid2d.min_range=1.2", "grid2d.max_range=3.5")
 RADIUS, HEIGHT, GROUND_CLEARANCE = 0.2, 0.5, 0.05  # [m] of the robot
 LASER_HEIGHT = 0.2  # [m]
+OPPOSITE = -0.86  # cosine between the directions in which start and goal lie from a box
+MAX_PAIRS = 60  # of start and goal tried past a box
 
 
 @dataclass(frozen=True)
@@ -140,26 +143,40 @@ def scored(lab: Lab) -> dict:
 
 
 def planned(lab: Lab) -> list[dict]:
-    """Plan on both grids past each box, from one side to the other, where both have room for start and goal."""
+    """Plan on both grids past each box, from one side to the other, until the laser's path hits it or no more places are left."""
     plans = []
     T_ls = se3.inverse(lab.T_sl)
     for solid in lab.scene.solids:
         if solid["name"] not in grid_truth.SPECIAL:
             continue
-        centre = se3.transform(T_ls, np.array([solid["centre"]]))[0, :2]
         best = None
-        for reach in (0.9, 1.2, 1.6):
-            for angle in np.arange(0.0, np.pi, np.pi / 12):
-                step = reach * np.array([np.cos(angle), np.sin(angle)])
-                routes = {name: route(grid, centre - step, centre + step) for name, grid in (("ours", lab.grid), ("laser", lab.laser))}
-                if None in routes.values():
-                    continue
-                hits = {name: touched(lab, found.xy) for name, found in routes.items()}
-                if best is None or (solid["name"] in hits["laser"] and solid["name"] not in best["laser"]):
-                    best = {"box": solid["name"], "routes": routes, **hits}
+        for start, goal in opposite_places(lab, se3.transform(T_ls, np.array([solid["centre"]]))[0, :2]):
+            routes = {name: route(grid, start, goal) for name, grid in (("ours", lab.grid), ("laser", lab.laser))}
+            if None in routes.values():
+                continue
+            hits = {name: touched(lab, found.xy) for name, found in routes.items()}
+            is_hit = solid["name"] in hits["laser"]
+            if best is None or is_hit:
+                best = {"box": solid["name"], "routes": routes, **hits}
+            if is_hit:
+                break
         if best is not None:
             plans.append(best)
     return plans
+
+
+def opposite_places(lab: Lab, centre: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Give pairs of places (2,) on opposite sides of a box with room for the robot in both grids, those near to each other first."""
+    room = np.minimum(*(planner.obstacle_distance(grid, allow_unknown=False) for grid in (lab.grid, lab.laser))) >= RADIUS
+    angle = np.arange(0.0, 2.0 * np.pi, np.pi / 12)
+    direction = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    step = (np.array([0.6, 0.9, 1.2, 1.6, 2.0])[:, None, None] * direction).reshape(-1, 2)
+    column, row = np.floor((centre + step - lab.grid.origin) / float(lab.grid.resolution)).astype(int).T
+    inside = (row >= 0) & (column >= 0) & (row < room.shape[0]) & (column < room.shape[1])
+    step = step[inside][room[row[inside], column[inside]]]
+    pairs = [(a, b) for a, b in itertools.combinations(step, 2) if a @ b < OPPOSITE * np.linalg.norm(a) * np.linalg.norm(b)]
+    pairs.sort(key=lambda pair: np.linalg.norm(pair[0] - pair[1]))
+    return [(centre + a, centre + b) for a, b in pairs[:MAX_PAIRS]]
 
 
 def route(grid: Grid, start: np.ndarray, goal: np.ndarray) -> planner.Route | None:
