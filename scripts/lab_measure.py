@@ -16,7 +16,7 @@ from slamcli.mapping.grid import FREE, OCCUPIED
 from slamcli.schema import Grid
 
 SEARCH = 0.12  # [m] to either side
-LEAST = 0.6  # [m] of an outline that must be found
+LEAST = 0.4  # [m] of an outline that must be found
 STEP = 0.02  # [m] between the rows followed
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from slamcli.errors import SlamError
 from slamcli.geometry import se3
 from slamcli.geometry.camera import Camera
-from slamcli.mapping.grid import FREE, OCCUPIED
+from slamcli.mapping.grid import FREE, OCCUPIED, UNKNOWN
 from slamcli.schema import Grid
 
 SUBCELLS = 5  # samples along a cell's side
@@ -118,7 +118,7 @@ class GridScore:
     n_free: int
     n_floor: int
     n_outline: int
-    special: dict[str, dict[str, int]]  # per special box: cells of its outline, occupied, free, unknown
+    special: dict[str, dict[str, int]]  # per special box: cells on it, occupied, free, unknown; outline cells seen, of these occupied
 
     def to_dict(self) -> dict[str, Any]:
         """Give the fields for JSON."""
@@ -149,19 +149,22 @@ def score(grid: Grid, scene: Scene, T_sl: np.ndarray, points: Iterable[np.ndarra
         n_free=int(free.sum()),
         n_floor=int(away.sum()),
         n_outline=int(outline.sum()),
-        special=_special(grid, scene, T_sl, band),
+        special=_special(grid, scene, T_sl, band, outline),
     )
 
 
-def _special(grid: Grid, scene: Scene, T_sl: np.ndarray, band: tuple[float, float]) -> dict[str, dict[str, int]]:
+def _special(grid: Grid, scene: Scene, T_sl: np.ndarray, band: tuple[float, float], outline: np.ndarray) -> dict[str, dict[str, int]]:
+    """Count the states of the cells that lie on each special box for more than half, and its seen outline as `outline_is_occupied` does."""
     counts = {}
+    occupied = grid.state == OCCUPIED
     for solid in scene.solids:
         if solid["name"] in SPECIAL:
-            inside = sample(grid, Scene(np.full(3, -np.inf), np.full(3, np.inf), [solid]), T_sl, band).mean(axis=-1) > 0.5
-            states = grid.state[inside]
+            share = sample(grid, Scene(np.full(3, -np.inf), np.full(3, np.inf), [solid]), T_sl, band).mean(axis=-1)
+            states, seen_there = grid.state[share > 0.5], outline & (share > 0.0)
             counts[solid["name"]] = {
-                "cells": int(inside.sum()), "occupied": int((states == OCCUPIED).sum()), "free": int((states == FREE).sum()),
-                "unknown": int((states == -1).sum()),
+                "cells": len(states), "occupied": int((states == OCCUPIED).sum()), "free": int((states == FREE).sum()),
+                "unknown": int((states == UNKNOWN).sum()),
+                "outline": int(seen_there.sum()), "outline_occupied": int((seen_there & _grown(occupied)).sum()),
             }  # fmt: skip
     return counts
 

@@ -227,6 +227,16 @@ def test_a_grid_of_one_row_and_one_of_one_cell():
     assert fuse([view([7, 7], 0, is_floor=True)] * 3, settings=SETTINGS).state.tolist() == [[0]]
 
 
+def test_a_line_of_sight_does_not_slip_through_a_gap_of_one_cell_under_what_hangs():
+    camera = (30.5 * 0.05, 4.5 * 0.05, 0.6)
+    for gap, expected in (([4], UNKNOWN), ([3, 4, 5], FREE)):
+        face = view([[10, y] for y in range(9) if y not in gap], 20, camera=camera, layers=0xF000)
+        floor = view([8, 4], 0, camera=camera, is_floor=True)
+        made = fuse([face, floor] * 3, settings=SETTINGS)
+        assert made.state[4, 0] == expected
+        assert made.state[0, 2] == OCCUPIED
+
+
 def test_the_grid_holds_the_camera():
     made = fuse([view([3, 1], 20, camera=(-0.12, 0.26, 0.6))] * 2, settings=SETTINGS)
     assert made.state.shape == (5, 7)

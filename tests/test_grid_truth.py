@@ -82,7 +82,9 @@ def test_a_perfect_grid_has_full_marks(points, T_sl):
     assert score.free_is_free == score.free_is_free_exact == score.floor_is_free == 1.0
     assert score.outline_is_occupied == score.outline_is_occupied_exact == 1.0
     assert score.floor_is_occupied == 0.0
-    assert score.special["hanging_box"]["occupied"] == score.special["hanging_box"]["cells"]
+    for box in score.special.values():
+        assert box["occupied"] == box["cells"] > 0
+        assert box["outline_occupied"] == box["outline"] > 0
     assert score.n_floor > 5000 and score.n_outline > 300
 
 
@@ -105,7 +107,8 @@ def test_faults_are_counted(points):
     assert score.free_is_free_exact == pytest.approx(1.0 - 70 / score.n_free)
     assert 0.0 < score.floor_is_occupied <= 40 / score.n_floor
     assert score.outline_is_occupied < 0.98
-    assert score.special["hanging_box"] == {"cells": 70, "occupied": 0, "free": 70, "unknown": 0}
+    box = {"cells": 70, "occupied": 0, "free": 70, "unknown": 0, "outline": 16, "outline_occupied": 0}
+    assert score.special["hanging_box"] == box
     assert score.special["low_box"]["unknown"] == 60
 
 

@@ -153,7 +153,10 @@ def _map_lines(figures: dict[str, Any]) -> list[str]:
             f"      {grid['floor_is_free']:.2%} of the floor seen is called free, {grid['floor_is_occupied']:.2%} occupied",
             f"      {grid['outline_is_occupied']:.2%} of the obstacles' outlines seen are occupied",
         ]
-        lines += [f"      {name}: {box['occupied']} of {box['cells']} cells occupied" for name, box in grid["special"].items()]
+        lines += [
+            f"      {name}: {box['outline_occupied']} of the {box['outline']} outline cells seen are occupied, {box['free']} of its {box['cells']} cells free"
+            for name, box in grid["special"].items()
+        ]
     return lines
 
 

@@ -65,7 +65,7 @@ def spaced(T_lc: np.ndarray, *, metres: float, degrees: float) -> np.ndarray:
 def fuse(views: list[View], *, settings: GridConfig) -> Grid:
     """Fuse the views, in order, to one grid."""
     low, shape = extent(views, settings.resolution)
-    standing = _standing(views, low, shape, settings)
+    standing = _with_neighbours(_standing(views, low, shape, settings))
     p_empty = np.full(shape, np.nan, dtype=np.float32)
     n_seen = np.zeros(shape, dtype=np.int32)
     update = paper_update if settings.update == "paper" else evidence_update
@@ -89,6 +89,12 @@ def _standing(views: list[View], low: np.ndarray, shape: tuple[int, int], settin
         is_hit = view.n_band >= settings.n_low
         standing[view.cell[is_hit, 1] - low[1], view.cell[is_hit, 0] - low[0]] |= view.slices[is_hit]  # a cell is in a view once
     return standing
+
+
+def _with_neighbours(standing: np.ndarray) -> np.ndarray:
+    """Add to each cell the slices of the four beside it: a line of sight must not slip through a gap of one cell in an outline."""
+    padded = np.pad(standing, 1)
+    return standing | padded[:-2, 1:-1] | padded[2:, 1:-1] | padded[1:-1, :-2] | padded[1:-1, 2:]
 
 
 def extent(views: list[View], resolution: float) -> tuple[np.ndarray, tuple[int, int]]:
