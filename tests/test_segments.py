@@ -1,5 +1,6 @@
 """Map segments: begun where tracking is lost for good, joined by places both saw, kept apart and told of otherwise."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -144,9 +145,9 @@ def two_segments(rng) -> tuple[MapBuilder, np.ndarray, np.ndarray]:
     return builder, scene.T_gc, T_ab
 
 
-def measured(T_gc, i, j, twist=None) -> Candidate:
+def measured(T_gc, i, j, twist=None, n_inliers=90) -> Candidate:
     T_ij = se3.inverse(T_gc[i]) @ T_gc[j]
-    return Candidate(i, j, 0.4, 100, 90, T_ij=T_ij if twist is None else se3.exp(np.array(twist)) @ T_ij)
+    return Candidate(i, j, 0.4, 100, n_inliers, T_ij=T_ij if twist is None else se3.exp(np.array(twist)) @ T_ij)
 
 
 def test_closures_that_agree_join_and_the_one_that_does_not_is_left_out():
@@ -163,9 +164,19 @@ def test_closures_that_agree_join_and_the_one_that_does_not_is_left_out():
 
 def test_one_closure_alone_joins_nothing():
     builder, T_gc, _ = two_segments(np.random.default_rng(2))
-    contradicting = [measured(T_gc, 3, 1), measured(T_gc, 4, 1, [0.3, 0, 0, 0, 0, 0]), measured(T_gc, 5, 1, [0, 0, 0, 0.2, 0, 0])]
-    assert segments.find_join(builder, contradicting, least=2) is None
-    assert segments.find_join(builder, contradicting, least=1) is not None
+    assert segments.find_join(builder, [measured(T_gc, 3, 1)], least=2) is None
+    assert segments.find_join(builder, [measured(T_gc, 3, 1)], least=1) is not None
+
+
+@pytest.mark.parametrize(("n_inliers", "is_joined"), [(60, False), (30, True)])
+def test_what_looks_alike_in_two_places_joins_nothing(n_inliers, is_joined):
+    builder, T_gc, _ = two_segments(np.random.default_rng(3))
+    true = [measured(T_gc, 3, 1), measured(T_gc, 4, 1)]
+    next_door = se3.exp(np.array([2.0, 0, 0, 0, 0, 0]))
+    alike = [measured(T_gc, i, 0, n_inliers=n_inliers) for i in (4, 5)]
+    alike = [replace(c, T_ij=se3.inverse(T_gc[c.kf_i]) @ next_door @ T_gc[c.kf_j]) for c in alike]
+    found = segments.find_join(builder, [*true, *alike], least=2)
+    assert (found is not None) == is_joined
 
 
 def test_segments_are_numbered_by_their_frames():
