@@ -1,54 +1,21 @@
 """Map segments: begun where tracking is lost for good, joined by places both saw, kept apart and told of otherwise."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from scenes import CAMERA, ape, look_at, observe, room_points
+from scene_run import SENSOR, Run
+from scenes import ape, look_at, observe, room_points
 
-from slamcli import artifacts
-from slamcli.config import LoopConfig, OptimizeConfig, SensorConfig, TrackConfig
+from slamcli.config import TrackConfig
 from slamcli.errors import SlamError
 from slamcli.formats.trajectory import read_tum
 from slamcli.geometry import se3
 from slamcli.mapping import adjustment, segments
 from slamcli.mapping.closure import Candidate
 from slamcli.mapping.mapbuilder import MapBuilder
-from slamcli.schema import LOST, RELOCALISED, Features, Map, Matches, Tracks, Words, frame_poses, frame_segments, trajectory
+from slamcli.schema import LOST, RELOCALISED, Map, Tracks, frame_poses, frame_segments, trajectory
 from slamcli.stages import loop, optimize, track
-
-SENSOR = SensorConfig(pixel_noise=0.5)
-
-
-class Run:
-    """The stages from track to loop on a scene, as the pipeline would call them."""
-
-    def __init__(self, scene, folder, **loop_settings):
-        self.scene, self.folder, self.warnings = scene, folder, []
-        self.cfg = SimpleNamespace(track=TrackConfig(), sensor=SENSOR, optimize=OptimizeConfig(), loop=LoopConfig(**loop_settings))
-        self.warn, self.summary = self.warnings.append, {}
-
-    def load(self, cls, stage):
-        given = {Features: self.scene.features, Words: self.scene.words, Matches: self.scene.matches}
-        return given[cls] if cls in given else artifacts.load(cls, self.folder / stage)
-
-    def camera(self):
-        return CAMERA
-
-    def rng(self):
-        return np.random.default_rng(0)
-
-    def progress(self, items, label, total=None):
-        return items
-
-    def stage(self, module):
-        name = module.__name__.split(".")[-1]
-        (self.folder / name).mkdir()
-        self.summary[name] = module.run(self, self.folder / name, self.cfg, self)
-
-    def result(self, stage):
-        return self.load(Tracks, stage), self.load(Map, stage)
 
 
 def on_circle(start: float, stop: float, n: int) -> np.ndarray:
