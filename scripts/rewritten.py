@@ -101,7 +101,8 @@ def to_and_fro(lists: Listed, frames: int) -> Listed:
     colour = colour[:frames]
     truth = lists.truth
     if truth is not None:
-        stamp = np.concatenate([[again(s, turn) for s in truth.stamp] for turn in range(n_turns)])
+        during = (truth.stamp >= lists.start) & (truth.stamp <= lists.colour[-1][0])
+        stamp = np.concatenate([[again(s, turn) for s in truth.stamp[during]] for turn in range(n_turns)])
         order = np.unique(stamp, return_index=True)[1]
-        truth = Trajectory(stamp=stamp[order], T_wc=np.concatenate([truth.T_wc] * n_turns)[order])
+        truth = Trajectory(stamp=stamp[order], T_wc=np.concatenate([truth.T_wc[during]] * n_turns)[order])
     return replace(lists, colour=colour, depth=[entry for entry in depth if entry[0] <= colour[-1][0] + 0.02], truth=truth)

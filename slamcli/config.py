@@ -90,7 +90,7 @@ class TrackConfig:
     segment_after: int = option(10, "frames lost in a row, blank ones not counted, after which a new map segment begins; 0 = never", ge=0)
     key_frame_share: float = option(0.6, "a frame that holds less of its reference key frame's landmarks becomes one", gt=0, le=1)
     key_frame_gap: int = option(8, "frames between key frames at most, where the place is new", ge=1)
-    key_frame_views: int = option(25, "a place is known well once half its landmarks are seen by so many key frames", ge=1)
+    key_frame_views: int = option(20, "a place is known well once half its landmarks are seen by so many key frames", ge=1)
     share_key_frames: int = option(10, "neighbours in which a new key frame's landmarks are looked for", ge=0)
     share_max_distance: int = option(50, "descriptors that differ more are not one landmark [bits]", ge=1, le=256)
     window_key_frames: int = option(12, "key frames adjusted with each new one", ge=2)

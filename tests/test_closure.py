@@ -78,6 +78,17 @@ def test_closing_takes_the_drift_out(turn):
     assert before > 0.02 and 1e-4 < after < before / 3
 
 
+def test_a_lone_true_closure_outlasts_a_drift_of_five_degrees(turn):
+    scene, _, map_ = turn
+    builder = drifted(scene, map_, 4.0 * np.array([0.003, 0.001, 0.0, 0.0, 0.001, 0.0]))
+    far = [c for c in verified(scene, builder) if c.is_accepted and c.kf_i - c.kf_j > len(builder.kf) // 2][:1]
+    T_ij = se3.inverse(builder.kf.T_wk[far[0].kf_i]) @ builder.kf.T_wk[far[0].kf_j]
+    assert 4.0 < np.degrees(np.linalg.norm(se3.log(T_ij @ se3.inverse(far[0].T_ij))[3:])) < 7.0
+    graph = closure.close(builder, far, SETTINGS)
+    true = scene.T_gc[map_.kf_frame]
+    assert graph.is_kept.all() and ape(graph.T_wk, true) < 0.8 * ape(builder.kf.T_wk, true)
+
+
 def test_a_planted_false_closure_is_dropped(turn):
     scene, _, map_ = turn
     builder = MapBuilder.from_map(scene.features, map_)

@@ -1,5 +1,6 @@
 """The page holds what the run holds, needs nothing else, and lets no text from outside become markup."""
 
+import dataclasses
 import json
 import re
 import shutil
@@ -140,6 +141,15 @@ def test_remarks_are_sorted_by_gravity_and_name_what_is_wrong(made: finished.Fin
     assert kinds == sorted(kinds, key=(doubts.BAD, doubts.NOTE, doubts.GOOD).index)
     texts = " ".join(remark.text for remark in doubts.remarks(content))
     assert "fewer than 150 features" in texts  # the fake run has none at all
+
+
+def test_frames_of_other_map_segments_are_told_of(made: finished.Finished) -> None:
+    content = collect(RunDir.find(str(made.run)))
+    T_lc = content.T_lc.copy()
+    T_lc[-7:] = np.nan  # not lost, but in a frame of their own
+    texts = " ".join(remark.text for remark in doubts.remarks(dataclasses.replace(content, T_lc=T_lc)))
+    assert f"7 of {len(T_lc)} frames belong to map segments that could not be joined" in texts
+    assert "belong to map segments" not in " ".join(remark.text for remark in doubts.remarks(content))
 
 
 def test_example_route_stays_in_the_largest_free_region() -> None:

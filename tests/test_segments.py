@@ -1,53 +1,21 @@
 """Map segments: begun where tracking is lost for good, joined by places both saw, kept apart and told of otherwise."""
 
-from types import SimpleNamespace
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from scenes import CAMERA, ape, look_at, observe, room_points
+from scene_run import SENSOR, Run
+from scenes import ape, look_at, observe, room_points
 
-from slamcli import artifacts
-from slamcli.config import LoopConfig, OptimizeConfig, SensorConfig, TrackConfig
+from slamcli.config import TrackConfig
 from slamcli.errors import SlamError
 from slamcli.formats.trajectory import read_tum
 from slamcli.geometry import se3
 from slamcli.mapping import adjustment, segments
 from slamcli.mapping.closure import Candidate
 from slamcli.mapping.mapbuilder import MapBuilder
-from slamcli.schema import LOST, RELOCALISED, Features, Map, Matches, Tracks, Words, frame_poses, frame_segments, trajectory
+from slamcli.schema import LOST, RELOCALISED, Map, Tracks, frame_poses, frame_segments, trajectory
 from slamcli.stages import loop, optimize, track
-
-SENSOR = SensorConfig(pixel_noise=0.5)
-
-
-class Run:
-    """The stages from track to loop on a scene, as the pipeline would call them."""
-
-    def __init__(self, scene, folder, **loop_settings):
-        self.scene, self.folder, self.warnings = scene, folder, []
-        self.cfg = SimpleNamespace(track=TrackConfig(), sensor=SENSOR, optimize=OptimizeConfig(), loop=LoopConfig(**loop_settings))
-        self.warn, self.summary = self.warnings.append, {}
-
-    def load(self, cls, stage):
-        given = {Features: self.scene.features, Words: self.scene.words, Matches: self.scene.matches}
-        return given[cls] if cls in given else artifacts.load(cls, self.folder / stage)
-
-    def camera(self):
-        return CAMERA
-
-    def rng(self):
-        return np.random.default_rng(0)
-
-    def progress(self, items, label, total=None):
-        return items
-
-    def stage(self, module):
-        name = module.__name__.split(".")[-1]
-        (self.folder / name).mkdir()
-        self.summary[name] = module.run(self, self.folder / name, self.cfg, self)
-
-    def result(self, stage):
-        return self.load(Tracks, stage), self.load(Map, stage)
 
 
 def on_circle(start: float, stop: float, n: int) -> np.ndarray:
@@ -144,9 +112,9 @@ def two_segments(rng) -> tuple[MapBuilder, np.ndarray, np.ndarray]:
     return builder, scene.T_gc, T_ab
 
 
-def measured(T_gc, i, j, twist=None) -> Candidate:
+def measured(T_gc, i, j, twist=None, n_inliers=90) -> Candidate:
     T_ij = se3.inverse(T_gc[i]) @ T_gc[j]
-    return Candidate(i, j, 0.4, 100, 90, T_ij=T_ij if twist is None else se3.exp(np.array(twist)) @ T_ij)
+    return Candidate(i, j, 0.4, 100, n_inliers, T_ij=T_ij if twist is None else se3.exp(np.array(twist)) @ T_ij)
 
 
 def test_closures_that_agree_join_and_the_one_that_does_not_is_left_out():
@@ -163,9 +131,19 @@ def test_closures_that_agree_join_and_the_one_that_does_not_is_left_out():
 
 def test_one_closure_alone_joins_nothing():
     builder, T_gc, _ = two_segments(np.random.default_rng(2))
-    contradicting = [measured(T_gc, 3, 1), measured(T_gc, 4, 1, [0.3, 0, 0, 0, 0, 0]), measured(T_gc, 5, 1, [0, 0, 0, 0.2, 0, 0])]
-    assert segments.find_join(builder, contradicting, least=2) is None
-    assert segments.find_join(builder, contradicting, least=1) is not None
+    assert segments.find_join(builder, [measured(T_gc, 3, 1)], least=2) is None
+    assert segments.find_join(builder, [measured(T_gc, 3, 1)], least=1) is not None
+
+
+@pytest.mark.parametrize(("n_inliers", "is_joined"), [(60, False), (30, True)])
+def test_what_looks_alike_in_two_places_joins_nothing(n_inliers, is_joined):
+    builder, T_gc, _ = two_segments(np.random.default_rng(3))
+    true = [measured(T_gc, 3, 1), measured(T_gc, 4, 1)]
+    next_door = se3.exp(np.array([2.0, 0, 0, 0, 0, 0]))
+    alike = [measured(T_gc, i, 0, n_inliers=n_inliers) for i in (4, 5)]
+    alike = [replace(c, T_ij=se3.inverse(T_gc[c.kf_i]) @ next_door @ T_gc[c.kf_j]) for c in alike]
+    found = segments.find_join(builder, [*true, *alike], least=2)
+    assert (found is not None) == is_joined
 
 
 def test_segments_are_numbered_by_their_frames():

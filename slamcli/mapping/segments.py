@@ -11,6 +11,7 @@ from slamcli.mapping.mapbuilder import MapBuilder
 from slamcli.schema import Map, Tracks, frame_segments
 
 AGREE_M, AGREE_RAD = 0.1, 0.05  # closures that differ by less agree on how two segments lie
+OUTWEIGH = 2.0  # times the landmarks of any others that agree on something else
 
 
 def ranked(map_: Map, tracks: Tracks, main: int = 0) -> Map:
@@ -36,29 +37,39 @@ class Join:
     b: int
     T_ab: np.ndarray  # (4, 4) world of segment b to that of a
     closures: list[Candidate]
+    support: int  # landmarks that the closures found again
 
 
 def find_join(builder: MapBuilder, closures: list[Candidate], *, least: int) -> Join | None:
-    """Find the two segments for which most closures agree on how they lie; None where fewer than `least` do.
+    """Find the two segments for which the most speaks; None where fewer than `least` closures agree on how two segments lie.
 
-    One closure between segments stands alone: no odometry runs between them that could contradict it. So several have to say the same.
+    One closure between segments stands alone: no odometry runs between them that could contradict it. So several have to say the same,
+    and no others that say otherwise may come near them in weight, as they do where places look alike.
     """
-    segment, best = builder.kf.segment, None
+    segment = builder.kf.segment
     pairs = sorted({tuple(sorted((int(segment[c.kf_i]), int(segment[c.kf_j])))) for c in closures})
-    for a, b in ((a, b) for a, b in pairs if a != b):
-        here = [c for c in closures if {int(segment[c.kf_i]), int(segment[c.kf_j])} == {a, b}]
-        between = [c if segment[c.kf_i] == a else _turned(c) for c in here]
-        T_wi, T_wj, T_ij = (
-            np.array(T) for T in zip(*((builder.kf.T_wk[c.kf_i], builder.kf.T_wk[c.kf_j], c.T_ij) for c in between), strict=True)
-        )
-        T_ab = T_wi @ T_ij @ se3.inverse(T_wj)
-        # residual of closure n under the hypothesis of closure m, (m, n, 6)
-        e = se3.log(se3.inverse(T_wi) @ T_ab[:, None] @ T_wj @ se3.inverse(T_ij))
-        agrees = (np.linalg.norm(e[..., :3], axis=-1) < AGREE_M) & (np.linalg.norm(e[..., 3:], axis=-1) < AGREE_RAD)
-        m = int(np.argmax(agrees.sum(axis=1)))
-        if agrees[m].sum() >= max(least, 1 + (len(best.closures) if best else 0)):
-            best = Join(a, b, T_ab[m], [c for c, is_one in zip(here, agrees[m], strict=True) if is_one])
-    return best
+    found = [_between(builder, closures, a, b) for a, b in pairs if a != b]
+    return max((j for j in found if j is not None and len(j.closures) >= least), key=lambda j: j.support, default=None)
+
+
+def _between(builder: MapBuilder, closures: list[Candidate], a: int, b: int) -> Join | None:
+    """Find what most closures between segments a and b say of how they lie; None where others contradict them."""
+    segment = builder.kf.segment
+    here = [c for c in closures if {int(segment[c.kf_i]), int(segment[c.kf_j])} == {a, b}]
+    between = [c if segment[c.kf_i] == a else _turned(c) for c in here]
+    T_wi, T_wj, T_ij = (
+        np.array(T) for T in zip(*((builder.kf.T_wk[c.kf_i], builder.kf.T_wk[c.kf_j], c.T_ij) for c in between), strict=True)
+    )
+    T_ab = T_wi @ T_ij @ se3.inverse(T_wj)
+    # residual of closure n under the hypothesis of closure m, (m, n, 6)
+    e = se3.log(se3.inverse(T_wi) @ T_ab[:, None] @ T_wj @ se3.inverse(T_ij))
+    agrees = (np.linalg.norm(e[..., :3], axis=-1) < AGREE_M) & (np.linalg.norm(e[..., 3:], axis=-1) < AGREE_RAD)
+    weight = np.array([c.n_inliers for c in between])
+    m = int(np.argmax(agrees @ weight))
+    support, rival = int(agrees[m] @ weight), int(((agrees & ~agrees[m]) @ weight)[~agrees[m]].max(initial=0))
+    if support < OUTWEIGH * rival:
+        return None
+    return Join(a, b, T_ab[m], [c for c, is_one in zip(here, agrees[m], strict=True) if is_one], support)
 
 
 def _turned(c: Candidate) -> Candidate:

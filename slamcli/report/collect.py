@@ -109,7 +109,8 @@ def _truth_in_level(truth: Trajectory | None, ape: Ape | None, T_lw: np.ndarray)
 def _loops(run: RunDir, stage: str, map_: Map) -> np.ndarray:
     if stage != "loop":
         return np.empty((0, 2), dtype=np.int32)
-    return map_.kf_frame[run.load(Closures, "loop").closure_kf]
+    kf = run.load(Closures, "loop").closure_kf
+    return map_.kf_frame[kf[(map_.kf_segment[kf] == 0).all(axis=1)]]
 
 
 def _recording(run: RunDir) -> tuple[dict[str, Any], list[str]]:

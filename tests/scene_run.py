@@ -1,0 +1,42 @@
+"""The stages from track to loop on simulated landmarks, called as the pipeline calls them."""
+
+from types import SimpleNamespace
+
+import numpy as np
+from scenes import CAMERA
+
+from slamcli import artifacts
+from slamcli.config import LoopConfig, OptimizeConfig, SensorConfig, TrackConfig
+from slamcli.schema import Features, Map, Matches, Tracks, Words
+
+SENSOR = SensorConfig(pixel_noise=0.5)
+
+
+class Run:
+    """The stages from track to loop on a scene, as the pipeline would call them."""
+
+    def __init__(self, scene, folder, **loop_settings):
+        self.scene, self.folder, self.warnings = scene, folder, []
+        self.cfg = SimpleNamespace(track=TrackConfig(), sensor=SENSOR, optimize=OptimizeConfig(), loop=LoopConfig(**loop_settings))
+        self.warn, self.summary = self.warnings.append, {}
+
+    def load(self, cls, stage):
+        given = {Features: self.scene.features, Words: self.scene.words, Matches: self.scene.matches}
+        return given[cls] if cls in given else artifacts.load(cls, self.folder / stage)
+
+    def camera(self):
+        return CAMERA
+
+    def rng(self):
+        return np.random.default_rng(0)
+
+    def progress(self, items, label, total=None):
+        return items
+
+    def stage(self, module):
+        name = module.__name__.split(".")[-1]
+        (self.folder / name).mkdir()
+        self.summary[name] = module.run(self, self.folder / name, self.cfg, self)
+
+    def result(self, stage):
+        return self.load(Tracks, stage), self.load(Map, stage)
