@@ -66,7 +66,7 @@ class MatchConfig:
     method: str = option("words", "what is compared: features under one vocabulary node, or all", choices=("words", "brute"))
     vocabulary: str = option("", "vocabulary file; empty = the shipped one", is_file=True)
     node_level: int = option(1, "levels below the root at which features are compared under the same node", ge=0, le=12)
-    node_margin: int = option(8, "a feature also counts under a second node that is at most this much farther [bits]", ge=-1, le=256)
+    node_margin: int = option(7, "a feature also counts under a second node that is at most this much farther [bits]", ge=-1, le=256)
     window: int = option(1, "frames before it that each frame is matched to", ge=1, le=30)
     max_distance: int = option(64, "descriptors farther apart are no match [bits]", ge=0, le=256)
     ratio: float = option(0.8, "the nearest must be closer than this share of the second nearest's distance", gt=0, le=1)
