@@ -7,6 +7,7 @@
 
 RUN is a run directory of slamcli: its extract/frames.txt and extract/camera.json say which images go together, and its run.json where
 they are. Frames are handed over at the pace of their stamps, as its own examples do, since mapping goes on in other threads meanwhile.
+The wheel is linked against libGL and libGLEW even without a window (Debian: libgl1 libglew2.2 libegl1).
 The last line on standard output is a JSON object: frames, tracked, cpu_seconds and decode_cpu_seconds of the whole, wall seconds.
 """
 

@@ -57,6 +57,26 @@ def test_a_folder_without_pictures_is_a_clear_error(slamcli, tmp_path: Path) -> 
     assert done.exit_code == 1 and "neither pictures" in done.stderr
 
 
+@pytest.mark.parametrize(
+    "arguments, fault",
+    [
+        (("train", "no/such/a.npz", "."), "its folder is not there"),
+        (("info", "broken.npz"), "not a vocabulary of slamcli"),
+        (("info", "missing.npz"), "cannot be read"),
+        (("export", "a.txt", "broken.npz"), "not a vocabulary of slamcli"),
+        (("export", "no/such/a.txt"), "no/such/a.txt"),
+    ],
+)
+def test_vocab_commands_refuse_in_one_line(
+    slamcli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: tuple[str, ...], fault: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("broken.npz").write_bytes(b"PK\x03\x04 no more")
+    done = slamcli("vocab", *arguments)
+    assert done.exit_code == 1 and fault in done.stderr and done.stderr.startswith("Error: ") and done.stderr.count("\n") == 1
+    assert not Path("a.txt").exists()
+
+
 def test_the_shipped_vocabulary_is_the_default(slamcli) -> None:
     facts = json.loads(slamcli("vocab", "info", "--json").stdout)
     assert facts["words"] >= 10_000 and facts["bytes"] <= 5_000_000

@@ -28,6 +28,44 @@ def test_the_fast_score_is_that_of_the_definition(seed: int, height: int, width:
     np.testing.assert_array_equal(fast.corner_score(image, 3), naive.fast_score(image))
 
 
+def hostile() -> dict[str, np.ndarray]:
+    """Pictures at the ends of what 8 bits can hold, and such with very many equal scores."""
+    v, u = np.mgrid[0:52, 0:58]
+    lone = np.zeros((52, 58), np.uint8)
+    lone[25, 30] = 255
+    return {
+        "black": np.zeros((52, 58), np.uint8),
+        "white": np.full((52, 58), 255, np.uint8),
+        "lone bright pixel": lone,
+        "lone dark pixel": 255 - lone,
+        "saturated noise": np.random.default_rng(0).choice(np.array([0, 255], np.uint8), (52, 58)),
+        "checks of one pixel": ((u + v) % 2 * 255).astype(np.uint8),
+        "stripes": (u // 3 % 2 * 255).astype(np.uint8),
+        "dots": ((u % 9 == 4) & (v % 9 == 4)).astype(np.uint8) * 200,
+    }
+
+
+@pytest.mark.parametrize("name", hostile())
+def test_on_hostile_pictures_each_kernel_is_its_twin(name: str) -> None:
+    image = hostile()[name]
+    score = fast.corner_score(image, 3)
+    np.testing.assert_array_equal(score, naive.fast_score(image))
+    peak = naive.local_maxima(score, 5)
+    for only_best in (False, True):
+        found = fast.corners(image, border=19, cell=7, threshold=40, threshold_low=5, at_most=image.size if only_best else 0)
+        assert [tuple(at) for at in found.xy.tolist()] == naive.cell_corners(peak, 19, 7, 40, only_best)
+    places = found.summits(np.arange(len(found.xy)))
+    assert np.isfinite(places).all() and (np.abs(places - found.xy) <= 1).all()
+    smooth = filters.blur_2px(image)
+    np.testing.assert_array_equal(smooth, cv2.GaussianBlur(image, (7, 7), 2, sigmaY=2, borderType=cv2.BORDER_REFLECT_101))
+    xy = np.array([[19, 19], [38, 32], [30, 25], [31, 26]], np.int32)
+    angle = brief.orientation(image, xy)
+    np.testing.assert_allclose(angle, [naive.orientation(image, x, y, brief._disc()) for x, y in xy], atol=1e-6)
+    np.testing.assert_array_equal(
+        brief.descriptors(smooth, xy, angle), [naive.brief(smooth, x, y, a, PAIRS) for (x, y), a in zip(xy, angle, strict=True)]
+    )
+
+
 def test_a_margin_leaves_the_inside_as_it_is() -> None:
     image = texture(1, 40, 50)
     whole, inside = fast.corner_score(image, 3), fast.corner_score(image, 12)

@@ -49,6 +49,28 @@ def test_under_nodes_only_features_with_one_in_common_are_compared(seed: int, n_
     assert as_list(found) == expected
 
 
+EXTREMES = {
+    "all alike": (np.zeros((9, 32), np.uint8), np.zeros((7, 32), np.uint8)),
+    "as far apart as can be": (np.zeros((4, 32), np.uint8), np.full((5, 32), 255, np.uint8)),
+    "one and one": (np.full((1, 32), 7, np.uint8), np.full((1, 32), 6, np.uint8)),
+    "one among its copies": (np.full((1, 32), 7, np.uint8), np.full((6, 32), 7, np.uint8)),
+    "each twice": tuple(np.repeat(np.arange(8, dtype=np.uint8)[:, None] * np.ones(32, np.uint8), 2, axis=0) for _ in range(2)),
+}
+
+
+@pytest.mark.parametrize("name", EXTREMES)
+@pytest.mark.parametrize("ratio", [0.8, 1.0])
+def test_ties_and_extremes_are_matched_as_by_the_twin(name: str, ratio: float) -> None:
+    a, b = EXTREMES[name]
+    angles = np.zeros(len(a)), np.zeros(len(b))
+    every = np.ones((len(a), len(b)), bool)
+    found = hamming.match_brute(a, b, *angles, max_distance=256, ratio=ratio)
+    assert as_list(found) == naive.matches(a, b, every, 256, ratio)
+    nodes = np.zeros((len(a), 2), np.int32) - [0, 1], np.zeros((len(b), 2), np.int32) - [0, 1]
+    found = hamming.match_nodes(a, nodes[0], b, nodes[1], *angles, max_distance=256, ratio=ratio)
+    assert as_list(found) == naive.matches(a, b, every, 256, ratio * hamming.NODE_RATIO)
+
+
 def test_one_column_of_nodes_means_no_second_node() -> None:
     rng = np.random.default_rng(3)
     a, b = descriptors(rng, 40), descriptors(rng, 50)

@@ -126,6 +126,19 @@ def test_the_picture_shows_both() -> None:
     assert picture.shape == (148, 328, 3) and picture.dtype == np.uint8
 
 
+def test_each_key_point_is_drawn_where_it_is() -> None:
+    grey = texture(4, 120, 160)
+    plain, ours = plain_orb(grey, 200), orb.detect(grey, features=200)
+    picture = side_by_side(grey, plain, ours).astype(int)
+    is_drawn = picture[:, :, 1] - picture[:, :, 2] > 40
+    for points, left in ((plain, 0), (ours, 168)):
+        assert len(points) > 20
+        for (x, y), octave in zip(points.xy, points.octave, strict=True):
+            u, v, reach = int(x) + left, int(y) + 28, int(np.ceil(2.5 * 1.2 ** float(octave))) + 1
+            assert is_drawn[v - reach : v + reach + 1, u - reach : u + reach + 1].any()
+    assert not is_drawn[:28].any() and not is_drawn[:, 160:168].any()
+
+
 @pytest.mark.parametrize(
     "available, expected",
     [([500, 500], [67, 33]), ([50, 500], [50, 50]), ([500, 10], [90, 10]), ([10, 10], [10, 10]), ([0, 0], [0, 0])],

@@ -59,6 +59,42 @@ def test_a_centre_is_the_majority_of_its_members(small: Vocabulary) -> None:
             assert own == min(distance(desc[row], other.view(np.uint8)) for other in centres)
 
 
+@settings(max_examples=30, deadline=None)
+@given(seeds, st.integers(1, 30), st.integers(1, 6))
+def test_a_round_of_k_means_is_its_twin(seed: int, n: int, k: int) -> None:
+    rng = np.random.default_rng(seed)
+    desc = (
+        rng.integers(0, 256, (n, 32)).astype(np.uint8) if seed % 2 else np.repeat(rng.integers(0, 256, (1, 32)), n, axis=0).astype(np.uint8)
+    )
+    centres = rng.integers(0, 256, (k, 32)).astype(np.uint8)
+    rows, label = rng.permutation(n).astype(np.int32), np.full(n, -1, np.int32)
+    nearest = [min(range(k), key=lambda c: distance(centres[c], desc[row])) for row in rows]
+    assert kmeans._assign(desc.view(np.uint64), rows, centres.view(np.uint64), label) == n
+    assert label.tolist() == nearest
+    voted = centres.copy()
+    kmeans._vote(desc.view(np.uint64), rows, label, voted.view(np.uint64))
+    for c in range(k):
+        members = np.unpackbits(desc[rows[label == c]], axis=1)
+        expected = np.packbits(2 * members.sum(axis=0) >= len(members)) if len(members) else centres[c]
+        np.testing.assert_array_equal(voted[c], expected)
+
+
+def test_centres_start_far_apart_by_the_squared_distance_and_never_twice_alike() -> None:
+    """Three descriptors 0, 8 and 16 bits from the first: the second centre is the farther one in 4 of 5 cases, if the first is first."""
+    desc = np.zeros((3, 32), np.uint8)
+    desc[1, :1], desc[2, 1:3] = 255, 255
+    picked = []
+    for seed in range(600):
+        centres = kmeans._seed(desc.view(np.uint64), np.arange(3, dtype=np.int32), 2, np.random.default_rng(seed)).view(np.uint8)
+        if not centres[0].any():
+            picked.append(int(np.unpackbits(centres[1]).sum()))
+    assert set(picked) == {8, 16} and len(picked) > 150
+    assert 0.7 < np.mean(np.array(picked) == 16) < 0.9
+    alike = np.concatenate([desc, desc])
+    centres = kmeans._seed(alike.view(np.uint64), np.arange(6, dtype=np.int32), 6, np.random.default_rng(0))
+    assert len(centres) == len(np.unique(centres, axis=0)) == 3
+
+
 def test_same_descriptors_and_seed_give_the_same_tree() -> None:
     _, desc = groups(np.random.default_rng(2), 30, 10, 0.1)
     a, b = (kmeans.train([desc], branching=4, depth=3, rng=np.random.default_rng(7)) for _ in range(2))
@@ -111,6 +147,11 @@ def test_the_node_is_the_words_ancestor(small: Vocabulary, node_level: int) -> N
             assert small.level[v] > node_level
             v = small.parent[v - 1]
         assert small.level[ancestor] <= node_level
+
+
+def test_no_descriptor_has_no_word(small: Vocabulary) -> None:
+    word, node = vocabulary.quantise(small, np.zeros((0, 32), np.uint8))
+    assert word.shape == (0,) and node.shape == (0, 2)
 
 
 def test_a_word_vector_sums_to_one_and_leaves_out_words_of_no_weight() -> None:

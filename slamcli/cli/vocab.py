@@ -48,8 +48,11 @@ def train(
     import numpy as np
 
     from slamcli import console, training
+    from slamcli.errors import SlamError
     from slamcli.vision import kmeans, vocabulary
 
+    if not out.absolute().parent.is_dir():
+        raise SlamError(f"{out}: its folder is not there; make it first, training takes minutes")
     descriptors = training.descriptors(sources, features=features, every=every, progress=console.progress)
     names = ", ".join(Path(source).name for source in sources)
     made = kmeans.train(

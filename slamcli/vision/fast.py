@@ -60,11 +60,13 @@ def _score(_typing, centre, circle):
 
 @kernel
 def _score_inside(image: u1[::1], width: u8, margin: u8, score: u1[::1]):
-    """Write the score of every pixel at least `margin` px inside. image, score : (H W,) uint8.
+    """Write the score of every pixel at least `margin` px inside, 0 elsewhere. image, score : (H W,) uint8.
 
     There is no branch in the loop: the compiler turns it into 32 pixels a step, which is faster than testing
     candidates first (0.3 ms against 1.0 ms of cv2.FAST on 640 x 480).
     """
+    for k in range(len(score)):
+        score[k] = 0
     w1, w2, w3 = width, width * TWO, width * THREE
     for start in range(margin * width + margin, np.uintp(len(image)) - margin * width, width):
         for k in range(start, start + width - margin * TWO):
@@ -81,7 +83,7 @@ def corner_score(image: np.ndarray, margin: int) -> np.ndarray:
 
     image : (H, W) uint8; the outer `margin` px, at least RADIUS, score 0. A corner at threshold t is a pixel whose score is greater than t.
     """
-    score = np.zeros_like(image)
+    score = np.empty_like(image)  # set to 0 by the kernel, which does not hold the GIL
     _score_inside(image.ravel(), np.uintp(image.shape[1]), np.uintp(margin), score.ravel())
     return score
 
@@ -90,8 +92,11 @@ def corner_score(image: np.ndarray, margin: int) -> np.ndarray:
 def _local_maxima(score: u1[:, ::1], margin: u8, threshold: u1, peak: u1[:, ::1]):
     """Keep the scores above the threshold that are the largest of their 3 x 3 neighbours; of equal ones the last in reading order.
 
-    score : (H, W) uint8; peak : (H, >= W) uint8, written `margin` px, at least 1, from the edges
+    score : (H, W) uint8; peak : (H, >= W) uint8, 0 elsewhere and in the outer `margin` px, at least 1
     """
+    for y in range(peak.shape[0]):
+        for x in range(peak.shape[1]):
+            peak[y, x] = 0
     for y in range(margin, np.uintp(score.shape[0]) - margin):
         for x in range(margin, np.uintp(score.shape[1]) - margin):
             s, up, down, left, right = score[y, x], y - ONE, y + ONE, x - ONE, x + ONE
@@ -233,13 +238,14 @@ def corners(
     rank_by : "sum" for the response of [Z] (1), "fast" for the FAST score
     """
     height, width = image.shape
-    score, peak = corner_score(image, border - FIT_RADIUS), np.zeros((height, -(-width // 8) * 8), dtype=np.uint8)
+    score, peak = corner_score(image, border - FIT_RADIUS), np.empty((height, -(-width // 8) * 8), dtype=np.uint8)
     _local_maxima(score, np.uintp(border), np.uint8(min(threshold, threshold_low)), peak)
-    room = (height // 2 + 1) * (width // 2 + 1)  # no two peaks touch
+    words = peak.view(np.uint64)
+    room = 4 * np.count_nonzero(words)  # no two of the eight pixels of a word that are peaks touch
     xy, strength, cell_of = np.empty((room, 2), dtype=np.int32), np.empty(room, dtype=np.uint8), np.empty(room, dtype=np.int32)
     best = np.zeros((-(-(height - 2 * border) // cell)) * (-(-(width - 2 * border) // cell)), dtype=np.uint8)
     histogram = np.zeros(256, dtype=np.int32)
-    n = _collect(peak.view(np.uint64), width, border, cell, xy, strength, cell_of, best, histogram)
+    n = _collect(words, width, border, cell, xy, strength, cell_of, best, histogram)
     if at_most:
         threshold = max(threshold, _level_of_rank(histogram, at_most))
     rows = np.empty(n, dtype=np.int32)

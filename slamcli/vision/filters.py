@@ -35,12 +35,16 @@ def _gaussian_7(image: u1[:, ::1], column: u4[::1], out: u1[:, ::1]):
 
 @kernel
 def _binomial_5(image: u1[:, ::1], column: u2[::1], out: u1[:, ::1]):
-    """Blur with the binomial 1 4 6 4 1 in both directions, a Gaussian of 1 px; the outer 2 px of out stay.
+    """Blur with the binomial 1 4 6 4 1 in both directions, a Gaussian of 1 px; the outer 2 px become 0.
 
     image, out : (H, W) uint8, H, W >= 5; column : (W,) uint16, scratch: the vertical sums of a row
     """
     height, width = uintp(image.shape[0]), uintp(image.shape[1])
-    for y in range(uintp(2), height - uintp(2)):
+    two = uintp(2)
+    for x in range(width):
+        out[0, x], out[1, x], out[height - two, x], out[height - uintp(1), x] = 0, 0, 0, 0
+    for y in range(two, height - two):
+        out[y, 0], out[y, 1], out[y, width - two], out[y, width - uintp(1)] = 0, 0, 0, 0
         for x in range(width):
             pair_0 = uint16(image[y - uintp(2), x]) + uint16(image[y + uintp(2), x])
             pair_1 = uint16(image[y - uintp(1), x]) + uint16(image[y + uintp(1), x])
@@ -60,6 +64,6 @@ def blur_2px(image: np.ndarray) -> np.ndarray:
 
 def blur_1px(image: np.ndarray) -> np.ndarray:
     """Blur against sensor noise before corners are sought; the outer 2 px become 0."""
-    out = np.zeros_like(image)
+    out = np.empty_like(image)
     _binomial_5(image, np.empty(image.shape[1], dtype=np.uint16), out)
     return out

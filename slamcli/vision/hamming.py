@@ -11,7 +11,7 @@ KEPT_BINS = 3
 FAR = 257  # [bits] more than two descriptors can differ by
 INDEX_BITS = 22  # of a number that holds a distance above an index
 NODE_RATIO = (
-    0.975  # among the few under a node the second nearest is farther than among all; this makes up for it: precision as of brute force
+    0.96  # among the few under a node the second nearest is farther than among all; this makes up for it: precision as of brute force
 )
 
 Match = tuple[np.ndarray, np.ndarray]
