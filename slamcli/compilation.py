@@ -82,8 +82,8 @@ def _cores() -> int:
 
 
 def _digest() -> str:
-    """Digest what compiled kernels depend on."""
-    digest = hashlib.sha256(f"{platform.node()} {platform.python_version()} {version('numba')}".encode())
+    """Digest what compiled kernels depend on, and where their sources are: numba keeps them apart by that too."""
+    digest = hashlib.sha256(f"{platform.node()} {platform.python_version()} {version('numba')} {Path(__file__).parent}".encode())
     for package in PACKAGES:
         for source in sorted((Path(__file__).parent / package).glob("*.py")):
             digest.update(source.read_bytes())
