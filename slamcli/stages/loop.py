@@ -113,7 +113,7 @@ def join_segments(builder: MapBuilder, recogniser, camera, cfg, rng) -> dict[tup
         fate += found.closures
         # What says otherwise is tried again like any loop, now that odometry of a kind runs between the segments.
         left = [c for c in left if are_apart(builder, c)]
-    alone = f"fewer than {cfg.loop.join_closures} closures agree on how the two map segments lie"
+    alone = f"closures between the two map segments are fewer than {cfg.loop.join_closures}, or others contradict it"
     return {(c.kf_i, c.kf_j): c for c in (*fate, *(closure.reject(c, alone) for c in left))}
 
 
