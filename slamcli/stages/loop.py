@@ -48,6 +48,7 @@ def run(inputs, out: Path, cfg, tools) -> dict:
 
 def main_first(map_: Map, tracks: Tracks, main: int) -> Map:
     """Number the segments by size and make the one that was asked for the main one."""
+    map_ = segments.ranked(map_, tracks)  # leaves no gap in the numbers where segments were joined
     n = max(1, segments.n_segments(map_))
     if main >= n:
         raise SlamError(f"loop.main_segment = {main}: the map has {n} segment{'s' * (n > 1)}; give a number below {n}")
