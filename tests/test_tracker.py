@@ -100,7 +100,7 @@ def test_a_place_seen_again_and_again_stops_the_map_from_growing():
     rng = np.random.default_rng(11)
     there, n = sweep(20), 8
     scene = observe(np.concatenate([there, there[::-1]] * n), room_points(3000, rng), rng)
-    bounded, endless = (track(scene, key_frame_views=views) for views in (6, 10**6))
+    bounded, endless = (track(scene, key_frame_crowd=crowd) for crowd in (4, 10**6))
     assert (bounded.tracks().state != LOST).all()
     grown = [np.count_nonzero(t.map().kf_frame >= 20 * n) for t in (bounded, endless)]
     assert grown[0] < 0.4 * grown[1] and grown[1] >= 20 * n // 8
@@ -110,6 +110,6 @@ def test_a_place_seen_again_and_again_stops_the_map_from_growing():
 def test_rotations_stay_orthonormal_from_key_frame_to_key_frame():
     rng = np.random.default_rng(12)
     scene = observe(sweep(60), room_points(3000, rng), rng)
-    R = track(scene, key_frame_gap=1, key_frame_views=10**6).map().T_wk[:, :3, :3]
+    R = track(scene, key_frame_gap=1, key_frame_crowd=10**6).map().T_wk[:, :3, :3]
     assert len(R) == 60
     assert np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max() < 1e-12

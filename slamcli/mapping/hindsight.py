@@ -40,7 +40,9 @@ def refine_frames(
 class _Look:
     """The second look at frames, and what it found."""
 
-    def __init__(self, builder, features, tracks, camera, sensor, settings) -> None:
+    def __init__(
+        self, builder: MapBuilder, features: Features, tracks: Tracks, camera: Camera, sensor: SensorConfig, settings: TrackConfig
+    ) -> None:
         self.builder, self.features, self.camera, self.sensor, self.settings = builder, features, camera, sensor, settings
         self.T_wc = np.full(tracks.T_kc.shape, np.nan)  # each in the world of its segment
         has_pose = tracks.ref_kf >= 0

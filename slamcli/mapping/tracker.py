@@ -11,6 +11,8 @@ from slamcli.mapping.mapbuilder import MapBuilder
 from slamcli.mapping.projection import FrameFeatures
 from slamcli.schema import KEY_FRAME, LOST, Features, Map, Matches, Words
 
+CROWD_M, CROWD_COSINE = 0.1, 0.9945  # key frames nearer than this, and turned by less than 6 degrees, stand in the same place
+
 
 class Tracker(Localiser):
     """Builds the map that it finds the frames in; `map()` gives it.
@@ -87,9 +89,14 @@ class Tracker(Localiser):
         leaves_reference = tracked.sum() < self.settings.key_frame_share * n_reference
         meets_new_surface = (tracked & has_depth).sum() < 100 and (~tracked & has_depth).sum() > 70
         is_overdue = i - self.builder.kf.frame[-1] >= self.settings.key_frame_gap
-        if is_overdue:  # where many key frames see the same already, another would only make the map, and every later frame, dearer
-            is_overdue = np.median(self.builder.lm.n_obs[lm_of[tracked]]) < self.settings.key_frame_views
-        return bool(leaves_reference or meets_new_surface or is_overdue)
+        return bool(meets_new_surface or ((leaves_reference or is_overdue) and not self._is_crowded(i)))
+
+    def _is_crowded(self, i: int) -> bool:
+        """Say whether so many key frames stand where frame `i` does that another would only make the map, and every later frame, dearer."""
+        kf, T_wc = self.builder.kf, self.pose_of(i)
+        is_here = (kf.segment == self.segment) & (np.linalg.norm(kf.T_wk[:, :3, 3] - T_wc[:3, 3], axis=1) < CROWD_M)
+        is_here &= kf.T_wk[:, :3, 2] @ T_wc[:3, 2] > CROWD_COSINE
+        return np.count_nonzero(is_here) >= self.settings.key_frame_crowd
 
     def _add_key_frame(self, i: int, frame: FrameFeatures, T_wc: np.ndarray, lm_of: np.ndarray) -> np.ndarray:
         """Make frame `i` a key frame, grow the map by what it sees, and adjust the window around it."""

@@ -48,6 +48,7 @@ def run(inputs, out: Path, cfg, tools) -> dict:
 
 def main_first(map_: Map, tracks: Tracks, main: int) -> Map:
     """Number the segments by size and make the one that was asked for the main one."""
+    map_ = segments.ranked(map_, tracks)  # leaves no gap in the numbers where segments were joined
     n = max(1, segments.n_segments(map_))
     if main >= n:
         raise SlamError(f"loop.main_segment = {main}: the map has {n} segment{'s' * (n > 1)}; give a number below {n}")
@@ -113,7 +114,7 @@ def join_segments(builder: MapBuilder, recogniser, camera, cfg, rng) -> dict[tup
         fate += found.closures
         # What says otherwise is tried again like any loop, now that odometry of a kind runs between the segments.
         left = [c for c in left if are_apart(builder, c)]
-    alone = f"fewer than {cfg.loop.join_closures} closures agree on how the two map segments lie"
+    alone = f"closures between the two map segments are fewer than {cfg.loop.join_closures}, or others contradict it"
     return {(c.kf_i, c.kf_j): c for c in (*fate, *(closure.reject(c, alone) for c in left))}
 
 
