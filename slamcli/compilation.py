@@ -42,13 +42,15 @@ def compile_all(processes: int) -> Iterator[str]:
 
     Nobody reads the errors that numba words, in colour, for every candidate type it tries in vain: without them it is a tenth faster.
     """
-    environment = {**os.environ, "NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING": "1"}
+    cache = os.path.abspath(os.environ["NUMBA_CACHE_DIR"])
+    environment = {**os.environ, "NUMBA_CACHE_DIR": cache, "NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING": "1"}
+    home = Path(__file__).parents[1]  # there a child finds this very package first: another copy's kernels are cached apart
     with contextlib.ExitStack() as stack:
         read, write = os.pipe()
         names = stack.enter_context(os.fdopen(read))
         for share in range(processes):
             command = [sys.executable, "-c", CHILD, str(share), str(processes)]
-            child = subprocess.Popen(command, env=environment, stdin=subprocess.DEVNULL, stdout=write, stderr=subprocess.DEVNULL)
+            child = subprocess.Popen(command, cwd=home, env=environment, stdin=subprocess.DEVNULL, stdout=write, stderr=subprocess.DEVNULL)
             stack.callback(child.wait)
             stack.callback(child.terminate)
         os.close(write)  # so that the pipe ends with the last child

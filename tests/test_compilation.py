@@ -63,6 +63,15 @@ def test_other_sources_are_compiled_again(monkeypatch: pytest.MonkeyPatch, tmp_p
     assert len(calls) == 2
 
 
+def test_the_processes_compile_this_package_and_not_one_that_lies_in_the_current_folder(
+    here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (here / "slamcli").mkdir()
+    (here / "slamcli" / "__init__.py").write_text("")
+    monkeypatch.setattr(compilation, "CHILD", "import slamcli; print(slamcli.__file__)")
+    assert list(compilation.compile_all(1)) == [str(Path(compilation.__file__).with_name("__init__.py"))]
+
+
 def test_an_interruption_ends_the_processes_that_compile(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(
         compilation,
