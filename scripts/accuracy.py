@@ -24,12 +24,12 @@ from pathlib import Path
 
 import numpy as np
 import rewritten
+import rivals
 
 from slamcli import config_io, evaluate
 from slamcli.config import Config
 from slamcli.console import table
 from slamcli.errors import SlamError
-from slamcli.formats.trajectory import read_tum
 from slamcli.pipeline import Pipeline
 from slamcli.rundir import RunDir
 
@@ -87,7 +87,7 @@ def measured(recording: str, given: argparse.Namespace) -> list[Result]:
                 found.append(replace(ours(features, config, seed), recording=Path(recording).name, offset=offset, every=every, who=who))
                 print(line_of(found[-1]), flush=True)
         for k in range(given.rival_runs if given.orbslam3 else 0):
-            found.append(replace(rival(features.path, *given.orbslam3), recording=Path(recording).name, offset=offset, every=every, seed=k))
+            found.append(replace(rival(features, *given.orbslam3), recording=Path(recording).name, offset=offset, every=every, seed=k))
             print(line_of(found[-1]), flush=True)
     return found
 
@@ -113,35 +113,17 @@ def ours(features: RunDir, config: Config, seed: int) -> Result:
         run.write_config(config)
         for stage in STAGES:
             Pipeline(run, config).run_alone(stage)
-    n_frames, truth = run.record("extract")["summary"]["frames"], evaluate.ground_truth(run)
-    trajectories = {stage: evaluate.stage_trajectory(run, stage) for stage in STAGES}
-    errors = {stage: rmse(found, truth, n_frames) for stage, found in trajectories.items()}
+    told = {stage: rivals.accuracy(run, evaluate.stage_trajectory(run, stage)) for stage in STAGES}
+    errors = {stage: float("nan") if f["ape"] is None else f["ape"] for stage, f in told.items()}
     cpu = sum(run.record(stage)["cpu_seconds"] - run.record(stage)["compile_seconds"] for stage in STAGES)
-    return Result("", 0, 1, seed, "", errors, len(trajectories["loop"].stamp) / n_frames, 1e3 * cpu / n_frames)
+    return Result("", 0, 1, seed, "", errors, told["loop"]["coverage"], 1e3 * cpu / rivals.n_frames(run))
 
 
-def rival(run: Path, python: str, vocabulary: str) -> Result:
+def rival(run: RunDir, python: str, words: str) -> Result:
     """Let ORB-SLAM3 track the images of a run."""
-    out = run / "orbslam3.txt"
-    script = Path(__file__).with_name("orbslam3.py")
-    done = subprocess.run([python, str(script), vocabulary, str(run), "--out", str(out)], check=True, capture_output=True, text=True)
-    told = json.loads(done.stdout.splitlines()[-1])
-    rundir = RunDir.find(str(run))
-    n_frames = rundir.record("extract")["summary"]["frames"]
-    error, coverage = float("nan"), 0.0
-    if told["tracked"]:
-        found = read_tum(out)
-        error, coverage = rmse(found, evaluate.ground_truth(rundir), n_frames), len(found.stamp) / n_frames
-    cpu = told["cpu_seconds"] - told["decode_cpu_seconds"]
-    return Result("", 0, 1, 0, "ORB-SLAM3", {"final": error}, coverage, 1e3 * cpu / n_frames)
-
-
-def rmse(found, truth, n_frames: int) -> float:
-    """Give the APE [m], NaN where there are too few poses to align."""
-    try:
-        return evaluate.statistics(evaluate.ape(found, truth, n_frames=n_frames, name="trajectory").error)["rmse"]
-    except SlamError:
-        return float("nan")
+    told = rivals.orbslam3(run, python, words)
+    error = float("nan") if told["ape"] is None else told["ape"]
+    return Result("", 0, 1, 0, "ORB-SLAM3", {"final": error}, told["coverage"], told["cpu_ms"])
 
 
 def line_of(result: Result) -> str:

@@ -1,48 +1,64 @@
 #!/usr/bin/env python
-"""What each stage of a run cost, from the records the stages left.
+"""What slamcli costs and how accurate it is, beside others on the same images.
 
-    python scripts/bench.py                                   the last run
+    python scripts/bench.py                                    what each stage of the last run cost, from its records
     python scripts/bench.py -r runs/tum/fr1_xyz
-    python scripts/bench.py --run tum/fr1_xyz [-s KEY=VALUE]   run every stage anew first, in a folder of its own
+    python scripts/bench.py RECORDING... [--orbslam3 ORB/bin/python words.txt] [--open3d]
+                            [--json figures.json] [--readme README.md]
 
-CPU time is of all threads; per frame it is divided by the recording's colour frames. Compiling kernels, which happens once per
-installation, is shown apart and is not part of the per-frame figures.
+With recordings, every stage runs anew in a process of its own, the others track the same images after it, and tables follow, in
+Markdown: time, in all and by stage (Table 3 of Zhao et al. 2020), APE (their Table 4) and map sizes (their Table 5). What others published is marked so.
+CPU time is of all threads, files included, per colour frame; compiling kernels, which happens once per machine, is no part of it.
+Machines differ: "of plain ORB" tells it as a multiple of what cv2.ORB_create(1000).detectAndCompute needs for the same images in the same
+session. --compare FILE warns where that multiple has grown by more than a tenth since FILE, the --json of an earlier session, was written;
+--readme puts the tables between the marks in that file. ORB-SLAM3 needs an environment of its own, see orbslam3.py.
 """
 
 import argparse
+import json
 import os
-import resource
 import subprocess
 import sys
 import tempfile
+import time
 from pathlib import Path
 from typing import Any
 
+import cv2
+import published
+import rivals
+
+from slamcli import evaluate
 from slamcli.console import table
 from slamcli.errors import SlamError
 from slamcli.rundir import RunDir
 from slamcli.stages import NAMES
 
 HEADINGS = ["stage", "wall [s]", "CPU [s]", "compiling [s]", "CPU [ms/frame]", "frames/s", "peak [MiB]", "output [MB]"]
+GROWTH = 1.1  # of the CPU time since the baseline that is warned of
+YARDSTICK_FRAMES = 100
+MARKS = "<!-- figures: scripts/bench.py --readme -->", "<!-- end of figures -->"
+OURS = "slamcli"
 
 
-def whole_process(n_frames: int) -> str:
-    """Tell what the child process cost in all: starting, importing and hashing belong to no stage."""
-    used = resource.getrusage(resource.RUSAGE_CHILDREN)
-    cpu = used.ru_utime + used.ru_stime
-    return f"whole process: {cpu:.1f} s CPU, {cpu / n_frames * 1e3:.1f} ms a frame with compiling; peak {used.ru_maxrss / 2**10:.0f} MiB"
+# one run, stage by stage
 
 
-def run_anew(target: str, assignments: list[str], folder: Path) -> RunDir:
-    """Run every stage in a process of its own, so that nothing here weighs on its memory."""
-    settings = [argument for assignment in assignments for argument in ("-s", assignment)]
-    subprocess.run([sys.executable, "-m", "slamcli", "run", target, "-r", str(folder), *settings], check=True, stdout=subprocess.DEVNULL)
-    return RunDir.find(str(folder))
+def show(run: RunDir) -> None:
+    """Print what each stage of a run cost."""
+    records = measured(run)
+    n_frames = records[0]["summary"]["frames"]
+    environment = records[-1]["environment"]
+    print(f"{run.info()['dataset']}: {n_frames} frames, {os.cpu_count()} cores; " + ", ".join(f"{k} {v}" for k, v in environment.items()))
+    print(table(rows(records, n_frames), right=range(1, len(HEADINGS))))
 
 
 def measured(run: RunDir) -> list[dict[str, Any]]:
     """Give the record of each stage that has been run, in order."""
-    return [record for name in NAMES if (record := run.record(name)) is not None]
+    records = [record for name in NAMES if (record := run.record(name)) is not None]
+    if not records or records[0]["stage"] != "extract":
+        raise SlamError(f"{run.path}: extract has not been run, so there is nothing to show")
+    return records
 
 
 def rows(records: list[dict[str, Any]], n_frames: int) -> list[list[str]]:
@@ -57,41 +73,194 @@ def row(name: str, records: list[dict[str, Any]], n_frames: int) -> list[str]:
     """Add up records and show them per frame of the recording."""
     wall, cpu, compiling = (sum(record[key] for record in records) for key in ("seconds", "cpu_seconds", "compile_seconds"))
     size = sum(entry["bytes"] for record in records for entry in record["outputs"].values())
-    per_frame = (cpu - compiling) / n_frames * 1e3
     rate = n_frames / (wall - compiling) if wall > compiling else float("inf")
     peak = max(record["peak_rss_mb"] for record in records)
+    per_frame = cpu_ms(records, n_frames)
     return [name, f"{wall:.1f}", f"{cpu:.1f}", f"{compiling:.1f}", f"{per_frame:.1f}", f"{rate:.1f}", f"{peak:.0f}", f"{size / 1e6:.1f}"]
 
 
-def show(run: RunDir) -> int:
-    """Print the table of a run; give its number of frames."""
+def cpu_ms(records: list[dict[str, Any]], n_frames: int) -> float:
+    """Give the CPU time of stages without compilation [ms a frame]."""
+    return 1e3 * sum(record["cpu_seconds"] - record["compile_seconds"] for record in records) / n_frames
+
+
+# recordings, side by side
+
+
+def measure(recording: str, given: argparse.Namespace, folder: Path) -> dict[str, Any]:
+    """Run everything on a recording and give its figures."""
+    subprocess.run([sys.executable, "-m", "slamcli", "run", recording, "-r", str(folder)], check=True, stdout=subprocess.DEVNULL)
+    run = RunDir.find(str(folder))
+    yardstick = plain_orb_ms(run)
+    systems = {OURS: ours(run)}
+    if given.orbslam3:
+        systems["ORB-SLAM3"] = rivals.orbslam3(run, *given.orbslam3)
+    if given.open3d:
+        systems["Open3D SLAM"] = rivals.open3d(run)
+    for figures in systems.values():
+        figures["of_plain_orb"] = figures["cpu_ms"] / yardstick
+    return {
+        "recording": run.info()["dataset"],
+        "is_simulated": (run.dataset().root / "scene.json").is_file(),
+        "frames": rivals.n_frames(run),
+        "plain_orb_ms": yardstick,
+        "systems": systems,
+        "bytes": {name: run.stage_path(*place).stat().st_size for name, place in MAP_FILES.items()},
+    }
+
+
+MAP_FILES = {
+    "cloud.ply": ("densify", "cloud.ply"),
+    "map.ot": ("octree", "map.ot"),
+    "map.bt": ("octree", "map.bt"),
+    "map.pgm": ("grid2d", "map.pgm"),
+}
+
+
+def ours(run: RunDir) -> dict[str, Any]:
+    """Give the figures of our own run, from its records."""
     records = measured(run)
-    if not records or records[0]["stage"] != "extract":
-        raise SlamError(f"{run.path}: extract has not been run, so there is nothing to show")
     n_frames = records[0]["summary"]["frames"]
-    environment = records[-1]["environment"]
-    print(f"{run.info()['dataset']}: {n_frames} frames, {os.cpu_count()} cores; " + ", ".join(f"{k} {v}" for k, v in environment.items()))
-    print(table(rows(records, n_frames), right=range(1, len(HEADINGS))))
-    return n_frames
+    figures = {
+        "cpu_ms": cpu_ms(records, n_frames),
+        "stages": {record["stage"]: cpu_ms([record], n_frames) for record in records},
+        "wall_seconds": sum(record["seconds"] - record["compile_seconds"] for record in records),
+        "peak_mib": max(record["peak_rss_mb"] for record in records),
+    }
+    return {**figures, **rivals.accuracy(run, evaluate.stage_trajectory(run, "loop"))}
+
+
+def plain_orb_ms(run: RunDir) -> float:
+    """Give the CPU time of OpenCV's ORB on images of the recording [ms], one thread, the least of three rounds."""
+    dataset = run.dataset()
+    images = [dataset.grey(i) for i in range(0, len(dataset), -(-len(dataset) // YARDSTICK_FRAMES))]
+    orb, rounds = cv2.ORB_create(1000), []
+    cv2.setNumThreads(1)
+    for _ in range(3):
+        start = time.process_time()
+        for image in images:
+            orb.detectAndCompute(image, None)
+        rounds.append(time.process_time() - start)
+    return 1e3 * min(rounds) / len(images)
+
+
+# tables
+
+
+def tables(found: list[dict[str, Any]]) -> str:
+    """Render all tables in Markdown."""
+    return "\n\n".join([time_table(found), stage_table(found), ape_table(found), size_table(found)])
+
+
+def name_of(figures: dict[str, Any]) -> str:
+    """Name a recording so that a simulated one cannot be taken for a real one."""
+    return f"{figures['recording']} (simulated)" if figures["is_simulated"] else figures["recording"]
+
+
+def time_table(found: list[dict[str, Any]]) -> str:
+    """What each system costs."""
+    rows = [["measured here", "system", "frames", "CPU [ms/frame]", "of plain ORB", "peak memory [MiB]"]]
+    for figures in found:
+        for system, f in figures["systems"].items():
+            cells = [str(figures["frames"]), f"{f['cpu_ms']:.0f}", f"{f['of_plain_orb']:.1f}", f"{f['peak_mib']:.0f}"]
+            rows.append([name_of(figures), f"{system}, maps included" if system == OURS else system, *cells])
+    return markdown(rows)
+
+
+def stage_table(found: list[dict[str, Any]]) -> str:
+    """Where our time goes."""
+    rows = [["slamcli, CPU [ms/frame], measured here", *NAMES]]
+    rows += [[name_of(figures), *(f"{figures['systems'][OURS]['stages'][stage]:.1f}" for stage in NAMES)] for figures in found]
+    return markdown(rows)
+
+
+def ape_table(found: list[dict[str, Any]]) -> str:
+    """How accurate each system is, and what others published."""
+    systems = list(dict.fromkeys(system for figures in found for system in figures["systems"]))
+    rows = [["APE RMSE [m] (frames with a pose)", *(f"{system}, measured here" for system in systems), *published.COLUMNS]]
+    for figures in found:
+        cells = [ape_cell(figures["systems"].get(system)) for system in systems]
+        rows.append([name_of(figures), *cells, *published.ape(figures["recording"])])
+    return markdown(rows)
+
+
+def ape_cell(f: dict[str, Any] | None) -> str:
+    """Show APE and coverage of one system."""
+    if f is None:
+        return ""
+    return f"{f['ape']:.4f} ({100 * f['coverage']:.1f} %)" if f["ape"] is not None else "no pose"
+
+
+def size_table(found: list[dict[str, Any]]) -> str:
+    """How large the maps are; the published share is of files whose formats the paper does not name."""
+    rows = [
+        ["map files", *(f"`{name}` [MB]" for name in MAP_FILES), "`map.bt` / `cloud.ply`", "`map.ot` / `cloud.ply`", published.SIZE_COLUMN]
+    ]
+    for figures in found:
+        size = figures["bytes"]
+        shares = [f"{100 * size[name] / size['cloud.ply']:.2f} %" for name in ("map.bt", "map.ot")]
+        rows.append(
+            [name_of(figures), *(f"{size[name] / 1e6:.3f}" for name in MAP_FILES), *shares, published.size_share(figures["recording"])]
+        )
+    return markdown(rows)
+
+
+def markdown(rows: list[list[str]]) -> str:
+    """Render rows, the first of them headings."""
+    lines = ["| " + " | ".join(row) + " |" for row in rows]
+    return "\n".join([lines[0], "|---" * len(rows[0]) + "|", *lines[1:]])
+
+
+def put_into(path: Path, text: str) -> None:
+    """Replace what stands between the marks."""
+    whole = path.read_text(encoding="utf-8")
+    before, found, rest = whole.partition(MARKS[0])
+    _, end, after = rest.partition(MARKS[1])
+    if not (found and end):
+        raise SlamError(f"{path}: there is no {MARKS[0]} ... {MARKS[1]}")
+    path.write_text(f"{before}{MARKS[0]}\n{text}\n{MARKS[1]}{after}", encoding="utf-8")
+
+
+def slower(found: list[dict[str, Any]], baseline: list[dict[str, Any]]) -> list[str]:
+    """Tell which stages cost more than in the baseline, in multiples of plain ORB."""
+    before, told = {figures["recording"]: figures for figures in baseline}, []
+    for figures in found:
+        old = before.get(figures["recording"])
+        for stage, cpu in figures["systems"][OURS]["stages"].items() if old else ():
+            was = old["systems"][OURS]["stages"].get(stage, cpu) / old["plain_orb_ms"]
+            now = cpu / figures["plain_orb_ms"]
+            if now > GROWTH * was and now - was > 0.02:
+                told.append(f"{figures['recording']}: {stage} costs {now:.2f} x plain ORB a frame, it was {was:.2f}")
+    return told
 
 
 def main() -> None:
     """Read the arguments and show what they ask for."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("-r", metavar="DIR", help="the run to show; default: $SLAMCLI_RUN, else runs/latest")
-    parser.add_argument("--run", metavar="TARGET", help="run this recording anew and show that")
-    parser.add_argument("-s", metavar="KEY=VALUE", action="append", default=[], help="setting for --run")
+    parser.add_argument("recordings", nargs="*", metavar="RECORDING")
+    parser.add_argument("-r", "--run", help="show the records of this run; without recordings")
+    parser.add_argument("--orbslam3", nargs=2, metavar=("PYTHON", "WORDS"))
+    parser.add_argument("--open3d", action="store_true", help="Open3D's dense RGB-D SLAM beside it")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures")
+    parser.add_argument("--readme", type=Path, metavar="FILE", help="put the tables into this file")
+    parser.add_argument("--compare", type=Path, metavar="FILE", help="figures of an earlier session")
     given = parser.parse_args()
     try:
-        if given.run:
-            with tempfile.TemporaryDirectory(prefix="slamcli-bench-") as folder:
-                print(whole_process(show(run_anew(given.run, given.s, Path(folder)))))
-        else:
-            show(RunDir.find(given.r))
-    except SlamError as error:
+        if not given.recordings:
+            show(RunDir.find(given.run))
+            return
+        with tempfile.TemporaryDirectory() as folder:
+            found = [measure(recording, given, Path(folder) / str(k)) for k, recording in enumerate(given.recordings)]
+        if given.json:
+            given.json.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+        print(tables(found))
+        if given.readme:
+            put_into(given.readme, tables(found))
+        if given.compare:
+            for line in slower(found, json.loads(given.compare.read_text(encoding="utf-8"))):
+                print(f"warning: {line}", file=sys.stderr)
+    except (SlamError, subprocess.CalledProcessError) as error:
         sys.exit(f"Error: {error}")
-    except subprocess.CalledProcessError as error:
-        sys.exit(error.returncode)
 
 
 if __name__ == "__main__":

@@ -1,11 +1,11 @@
 #!/usr/bin/env python
 """Loop closing in simulated rooms: whether the revisit is closed, whether any closure is false, and what it gains.
 
-    python scripts/places.py OUT [--seeds 0 1 2 ...] [--alias-seeds 0] [--laps 2.09] [--frames 540]
+    python scripts/places.py OUT [--seeds 0 1 2 ...] [--alias-seeds 0] [--laps 2.09] [--frames 540] [--orbslam3 PYTHON WORDS]
 
 For each seed a furnished room of 8 m x 5 m is driven round twice by a camera with a Kinect's noise. Rooms built to alias follow: twin
 walls with the same posters opposite, and corridors of equal doors. OUT keeps recordings and runs, which are used again; the table comes
-from the runs' records, the truth from groundtruth.txt.
+from the runs' records, the truth from groundtruth.txt. With --orbslam3, see orbslam3.py, it tracks the same images.
 """
 
 import argparse
@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import rivals
 
 from slamcli import evaluate
 from slamcli.console import table
@@ -26,7 +27,20 @@ from slamcli.stages import NAMES
 
 FALSE_M, FALSE_DEG = 0.2, 5.0  # a closure that is off by more claims the wrong place
 REVISIT = 0.6  # laps that lie between two visits at least
-HEADINGS = ["room", "frames", "lost", "segments", "closures", "of revisits", "false", "track [m]", "optimize [m]", "loop [m]", "loop CPU"]
+HEADINGS = [
+    "room",
+    "frames",
+    "lost",
+    "segments",
+    "closures",
+    "of revisits",
+    "false",
+    "track [m]",
+    "optimize [m]",
+    "loop [m]",
+    "loop CPU",
+    "ORB-SLAM3 [m]",
+]
 ROOMS = {"posters": ("posters", 0), "corridor": ("corridor", 0), "corridor2": ("corridor", 1)}  # alias and how much is added to the seed
 
 
@@ -43,12 +57,14 @@ class Figures:
     false: int
     ape: dict[str, float]  # [m], by stage
     loop_share: float  # of the run's CPU time
+    rival: float | None  # [m], ORB-SLAM3's APE
 
     def row(self) -> list[str]:
         """Make a line of the table."""
         counts = (self.n_frames, self.lost, self.segments, self.closures, self.revisits, self.false)
         errors = (f"{self.ape[stage]:.4f}" for stage in evaluate.STAGES)
-        return [self.name, *map(str, counts), *errors, f"{100 * self.loop_share:.1f} %"]
+        rival = "" if self.rival is None else f"{self.rival:.4f}"
+        return [self.name, *map(str, counts), *errors, f"{100 * self.loop_share:.1f} %", rival]
 
 
 def main() -> None:
@@ -59,19 +75,21 @@ def main() -> None:
     parser.add_argument("--alias-seeds", type=int, nargs="*", default=[0])
     parser.add_argument("--laps", type=float, default=2.09)
     parser.add_argument("--frames", type=int, default=540)
+    parser.add_argument("--orbslam3", nargs=2, metavar=("PYTHON", "WORDS"))
     given = parser.parse_args()
     rooms = {f"room{seed}": ["--seed", str(seed)] for seed in given.seeds}
     for seed in given.alias_seeds:
         rooms |= {f"{name}{seed}": ["--alias", alias, "--seed", str(seed + more)] for name, (alias, more) in ROOMS.items()}
     found = []
     for name, options in rooms.items():
-        found.append(one(given.out / name, name, [*options, "--laps", str(given.laps), "--frames", str(given.frames)], given.laps))
+        drive = ["--laps", str(given.laps), "--frames", str(given.frames)]
+        found.append(one(given.out / name, name, [*options, *drive], given.laps, given.orbslam3))
         print(table([HEADINGS, found[-1].row()], right=range(1, len(HEADINGS))), flush=True)
     print("\n" + table([HEADINGS, *(figures.row() for figures in found)], right=range(1, len(HEADINGS))))
     summary(found)
 
 
-def one(folder: Path, name: str, options: list[str], laps: float) -> Figures:
+def one(folder: Path, name: str, options: list[str], laps: float, rival: list[str] | None) -> Figures:
     """Render and run one room, unless done already, and compare with the truth."""
     recording, path = folder / "recording", folder / "run"
     folder.mkdir(parents=True, exist_ok=True)
@@ -98,6 +116,7 @@ def one(folder: Path, name: str, options: list[str], laps: float) -> Figures:
         false=int((~is_true).sum()),
         ape=ape,
         loop_share=cpu["loop"] / sum(cpu.values()),
+        rival=rivals.orbslam3(run, *rival)["ape"] if rival else None,
     )
 
 
@@ -122,6 +141,9 @@ def summary(found: list[Figures]) -> None:
     print(f"false closures: {sum(figures.false for figures in found)} of {sum(figures.closures for figures in found)}")
     print(f"rooms whose revisit is closed: {sum(figures.revisits > 0 for figures in honest)} of {len(honest)}")
     if len(honest):
+        others = [figures.rival for figures in honest if figures.rival is not None]
+        if others:
+            print(f"ORB-SLAM3's APE, median of {len(others)} rooms: {np.median(others):.4f} m")
         drifted = before > 0.02
         print(
             f"APE after loop, median: {np.median(after):.4f} m; worse than after track by at most {max(0.0, (after - before).max()):.4f} m"
