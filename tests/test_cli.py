@@ -180,14 +180,14 @@ def test_no_permission_to_write_is_one_line(fake: Path, slamcli: Slamcli) -> Non
 
 def test_ctrl_c_ends_the_program_with_130(fake: Path) -> None:
     code = (
-        "import sys, time, fakes; from slamcli.stages import STAGES; fakes.install(sys.modules)\n"
+        "import signal, sys, time, fakes; from slamcli.stages import STAGES; fakes.install(sys.modules)\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # what is started in the background ignores it
         "sys.modules['slamcli.stages.track'] = fakes.module(STAGES[2], lambda out: (print('in', flush=True), time.sleep(60)))\n"
         f"from pathlib import Path; fakes.make_run(Path('run'), Path({str(fake / 'recordings' / 'desk')!r}))\n"
         "import slamcli.datasets; slamcli.datasets.open_dataset = lambda root, **_: fakes.FakeDataset(Path(root))\n"
         "from slamcli.cli.main import cli; cli(['run', '-r', 'run'])\n"
     )
-    folder = Path(__file__).parent
-    environment = {**os.environ, "PYTHONPATH": f"{folder}:{folder.parent}"}
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
     child = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=environment, text=True)
     try:
         assert child.stdout.readline() == "in\n"

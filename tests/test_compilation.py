@@ -30,7 +30,8 @@ cli(sys.argv[1:])
 
 def test_a_run_compiles_nothing_that_was_not_compiled_before_it(room: Path, tmp_path: Path) -> None:
     command = [sys.executable, "-c", WATCHED_RUN, "run", str(room), "-r", str(tmp_path / "run")]
-    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=300)
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}  # this copy, from wherever
+    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=300, cwd=tmp_path, env=environment)
     assert "grid2d" in done.stderr
     assert "compiled" not in done.stdout
 

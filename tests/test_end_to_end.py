@@ -33,7 +33,9 @@ def digests(path: Path) -> dict[str, str]:
 
 def start(*arguments: str, **environment: str) -> subprocess.Popen:
     command = [sys.executable, "-m", "slamcli", *arguments]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env={**os.environ, **environment})
+    elsewhere = Path(arguments[arguments.index("-r") + 1]).parent  # in the checkout it would be another copy than the one under test
+    variables = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), **environment}
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=variables, cwd=elsewhere)
 
 
 def test_every_stage_leaves_its_files_and_is_up_to_date(room_run: Path, slamcli: Callable[..., Result]) -> None:
