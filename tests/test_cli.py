@@ -54,11 +54,25 @@ def states(slamcli: Slamcli, *arguments: object) -> dict[str, str]:
 def test_run_makes_a_run_named_after_the_recording_and_prints_where(fake: Path, slamcli: Slamcli) -> None:
     result = slamcli("run", "recordings/desk")
     assert (result.exit_code, result.stdout) == (0, "runs/desk\n")
-    assert [line.split()[0] for line in result.stderr.splitlines()] == ["Warning:", *NAMES]
+    made = ["trajectory", "cloud", "octree", "grid", "cost", "warnings"]
+    assert [line.split()[0] for line in result.stderr.splitlines()] == ["Warning:", *NAMES, *made, "next:"]
     assert "extract: rgb.txt: 2 repeated stamps" in result.stderr
     assert "3 frames" in result.stderr
     assert os.readlink("runs/latest") == "desk"
     assert sorted(os.listdir("runs/desk")) == sorted([*NAMES, ".lock", "config.toml", "log.txt", "run.json"])
+
+
+def test_a_finished_run_tells_what_it_made_and_what_comes_next(fake: Path, slamcli: Slamcli) -> None:
+    told = slamcli("run", "recordings/desk").stderr
+    for text in ("2 of 3 frames, 2 loops closed", "500 points", "60 occupied and 70 free cells", "8 x 9 cells", "grid2d/map.pgm"):
+        assert text in told
+    assert "next: slamcli report; " in told  # without a true trajectory there is nothing to evaluate
+    (fake / "recordings" / "desk" / "groundtruth.txt").write_text("")
+    assert "next: slamcli eval ape; slamcli report" in slamcli("run").stderr
+
+
+def test_a_run_that_stops_on_the_way_tells_no_outcome(fake: Path, slamcli: Slamcli) -> None:
+    assert "next:" not in slamcli("run", "recordings/desk", "--until", "octree").stderr
 
 
 def test_run_again_runs_nothing_and_run_without_target_goes_on(fake: Path, slamcli: Slamcli) -> None:

@@ -51,7 +51,8 @@ def run_command(
       slamcli run tum/fr1_room -s extract.features=1500
       slamcli run path/to/recording -r runs/mine --config accurate
     """
-    from slamcli import config_io
+    from slamcli import config_io, console
+    from slamcli.outcome import outcome
     from slamcli.rundir import RunDir
 
     if target is None:
@@ -62,6 +63,8 @@ def run_command(
     with _writing(rundir, config, dataset) as pipeline:
         rundir.mark_latest()
         pipeline.bring_up_to_date(start=start, until=until, force=force)
+    if until is None and (made := outcome(rundir)):
+        console.say(made)
     click.echo(rundir.path)
 
 
