@@ -206,7 +206,8 @@ def test_killed_between_the_two_renames_the_earlier_result_comes_back(pipeline: 
 
 def kill(path: Path, root: Path, stage: str, where: str) -> None:
     code = f"import fakes; fakes.run_and_die({str(path)!r}, {str(root)!r}, {stage!r}, {where!r})"
-    done = subprocess.run([sys.executable, "-c", code], env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}, timeout=60)
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, cwd=path.parent, timeout=60)
     assert done.returncode == -9
 
 
