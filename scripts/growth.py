@@ -1,11 +1,11 @@
 #!/usr/bin/env python
 """How a run's cost grows with the length of its recording.
 
-    python scripts/growth.py RECORDING OUT [--frames 10000]
+    python scripts/growth.py RECORDING OUT [--frames 10000] [--first 5000] [--restart]
 
-RECORDING is played forward and backward again and again, until there are as many frames, and half as many. Of each stage: CPU time per
-frame of the first half and of the second, which is what the longer run took more than the shorter; compiling is left out. OUT keeps
-recordings (lists, with links to the images) and runs, which are used again.
+RECORDING is played forward and backward again and again, or with --restart from its start each time, until there are as many frames. Of
+each stage: CPU time per frame of the first part and of the rest, which is what the whole took more than a run of the first part alone, and
+the peak memory of both; compiling is left out. OUT keeps recordings (lists, with links to the images) and runs, which are used again.
 """
 
 import argparse
@@ -21,7 +21,7 @@ from slamcli.errors import SlamError
 from slamcli.rundir import RunDir
 from slamcli.stages import NAMES
 
-HEADINGS = ["stage", "first half [ms/frame]", "second half [ms/frame]", "ratio", "share of the long run", "peak [MiB]"]
+HEADINGS = ["stage", "first part [ms/frame]", "rest [ms/frame]", "ratio", "share of the whole", "peak of first [MiB]", "of whole [MiB]"]
 
 
 def main() -> None:
@@ -29,39 +29,43 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("recording")
     parser.add_argument("out", type=Path)
-    parser.add_argument("--frames", type=int, default=10000, help="of the longer recording")
+    parser.add_argument("--frames", type=int, default=10000, help="of the whole [10000]")
+    parser.add_argument("--first", type=int, help="of the first part [half of them]")
+    parser.add_argument("--restart", action="store_true", help="play from the start each time instead of turning back")
     given = parser.parse_args()
+    first = given.first or given.frames // 2
     try:
         lists = rewritten.listed(given.recording)
-        short, long = (run_of(lists, n, given.out) for n in (given.frames // 2, given.frames))
-        print(table([HEADINGS, *rows(short, long, given.frames)], right=range(1, len(HEADINGS))))
+        short, long = (run_of(lists, n, given.out, turning=not given.restart) for n in (first, given.frames))
+        print(table([HEADINGS, *rows(short, long, first, given.frames)], right=range(1, len(HEADINGS))))
         for run in (short, long):
             print(summary(run))
     except SlamError as error:
         sys.exit(f"Error: {error}")
 
 
-def run_of(lists: rewritten.Listed, frames: int, out: Path) -> RunDir:
+def run_of(lists: rewritten.Listed, frames: int, out: Path, *, turning: bool) -> RunDir:
     """Bring the run of so many frames up to date."""
-    recording = rewritten.write(out / f"frames{frames}", rewritten.to_and_fro(lists, frames))
-    folder = out / f"frames{frames}.run"
-    subprocess.run([sys.executable, "-m", "slamcli", "run", str(recording), "-r", str(folder)], check=True, stdout=subprocess.DEVNULL)
+    name = f"frames{frames}" if turning else f"restarted{frames}"
+    recording = rewritten.write(out / name, rewritten.again(lists, frames, turning=turning))
+    folder = out / f"{name}.run"
+    for stage in NAMES:  # each in a process of its own: what it holds at its peak is its own, too
+        command = [sys.executable, "-m", "slamcli", "run", str(recording), "-r", str(folder), "--until", stage]
+        subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
     return RunDir.find(str(folder))
 
 
-def rows(short: RunDir, long: RunDir, frames: int) -> list[list[str]]:
-    """Make a line of each stage, and of their sum."""
+def rows(short: RunDir, long: RunDir, first: int, frames: int) -> list[list[str]]:
+    """Make a line of each stage, and of all together."""
     cpu = {name: [seconds(run, name) for run in (short, long)] for name in NAMES}
     cpu["all"] = [sum(both) for both in zip(*cpu.values(), strict=True)]
-    peak = {name: long.record(name)["peak_rss_mb"] for name in NAMES}
-    peak["all"] = max(peak.values())
-    half = frames // 2
+    peak = {name: [run.record(name)["peak_rss_mb"] for run in (short, long)] for name in NAMES}
+    peak["all"] = [max(of) for of in zip(*peak.values(), strict=True)]
     found = []
-    for name, (first, both) in cpu.items():
-        second = both - first
-        figures = (1e3 * first / half, 1e3 * second / (frames - half))
-        shares = (f"{second / first:.2f}", f"{100 * both / cpu['all'][1]:.1f} %", f"{peak[name]:.0f}")
-        found.append([name, *(f"{value:.2f}" for value in figures), *shares])
+    for name, (before, both) in cpu.items():
+        figures = (1e3 * before / first, 1e3 * (both - before) / (frames - first))
+        shares = (f"{figures[1] / figures[0]:.2f}", f"{100 * both / cpu['all'][1]:.1f} %")
+        found.append([name, *(f"{value:.2f}" for value in figures), *shares, *(f"{value:.0f}" for value in peak[name])])
     return found
 
 

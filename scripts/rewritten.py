@@ -86,23 +86,25 @@ def blackout(lists: Listed, first: int, frames: int) -> Listed:
     return replace(lists, colour=colour, depth=depth)
 
 
-def to_and_fro(lists: Listed, frames: int) -> Listed:
-    """Play forward and backward in turn until there are so many colour frames; stamps go on at the same pace."""
-    period = lists.colour[-1][0] - lists.start + (lists.colour[1][0] - lists.start)
+def again(lists: Listed, frames: int, *, turning: bool = True) -> Listed:
+    """Play again and again until there are so many colour frames, every other time backward if `turning`; stamps go on at the same pace."""
+    length = lists.colour[-1][0] - lists.start
+    period = length + (lists.colour[1][0] - lists.start)
     n_turns = -(-frames // len(lists.colour))
 
-    def again(stamp: float, turn: int) -> float:
+    def shifted(stamp: float, turn: int) -> float:
         seconds = stamp - lists.start
-        return lists.start + turn * period + (seconds if turn % 2 == 0 else lists.colour[-1][0] - lists.start - seconds)
+        return lists.start + turn * period + (length - seconds if turning and turn % 2 else seconds)
 
     colour, depth = (
-        sorted((again(stamp, turn), name) for turn in range(n_turns) for stamp, name in entries) for entries in (lists.colour, lists.depth)
+        sorted((shifted(stamp, turn), name) for turn in range(n_turns) for stamp, name in entries)
+        for entries in (lists.colour, lists.depth)
     )
     colour = colour[:frames]
     truth = lists.truth
     if truth is not None:
         during = (truth.stamp >= lists.start) & (truth.stamp <= lists.colour[-1][0])
-        stamp = np.concatenate([[again(s, turn) for s in truth.stamp[during]] for turn in range(n_turns)])
+        stamp = np.concatenate([[shifted(s, turn) for s in truth.stamp[during]] for turn in range(n_turns)])
         order = np.unique(stamp, return_index=True)[1]
         truth = Trajectory(stamp=stamp[order], T_wc=np.concatenate([truth.T_wc[during]] * n_turns)[order])
     return replace(lists, colour=colour, depth=[entry for entry in depth if entry[0] <= colour[-1][0] + 0.02], truth=truth)

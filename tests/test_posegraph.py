@@ -177,6 +177,28 @@ def test_a_group_of_false_edges_that_agree_with_each_other():
     np.testing.assert_allclose(ape(found.T_wk, T_true), ape(clean.T_wk, T_true), rtol=0.01)
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_many_false_edges_by_metres_and_half_turns_do_not_take_the_true_ones_with_them(seed):
+    """As between the equal doors of a corridor, where most of what looks alike is another door."""
+    rng = np.random.default_rng(200 + seed)
+    T_true, T, edges, measured, information = chain(6 + seed, 3)
+    lap = round(N_KF / 1.4)
+    ends = np.array([sorted(rng.choice(N_KF, 2, replace=False))[::-1] for _ in range(40)])
+    ends = ends[(np.abs(ends[:, 0] - ends[:, 1]) > 8) & (np.abs(np.abs(ends[:, 0] - ends[:, 1]) - lap) > 4)][:12]
+    twist = np.zeros((len(ends), 6))
+    twist[:, 0] = 2.0 * rng.integers(1, 10, len(ends))
+    twist[:, 4] = np.pi * (1.0 - 1e-3) * rng.integers(0, 2, len(ends))
+    edges = np.concatenate([edges, ends])
+    measured = np.concatenate([measured, se3.exp(twist) @ between(T_true, ends)])
+    information = np.concatenate([information, np.tile(information[:1], (len(ends), 1, 1))])
+    is_robust = np.arange(len(edges)) >= N_KF - 1
+    result = posegraph.optimize(T, edges, measured, information, is_fixed=FIRST, is_robust=is_robust)
+    np.testing.assert_array_equal(result.is_kept[is_robust], np.arange(3 + len(ends)) < 3)
+    alone = slice(0, N_KF + 2)
+    without = posegraph.optimize(T, edges[alone], measured[alone], information[alone], is_fixed=FIRST, is_robust=is_robust[alone])
+    np.testing.assert_allclose(result.T_wk, without.T_wk, atol=1e-4)
+
+
 def test_edges_that_repeat_each_other_do_not_stiffen_the_chain():
     """Ten map edges per key frame hold the drift; closures must still be believed, and a false one not."""
     rng = np.random.default_rng(8)

@@ -75,6 +75,8 @@ def optimize(
     if is_robust.any():
         total += _graduate(graph, is_robust, chi2_limit)
         is_kept = ~is_robust | (graph.chi2() <= chi2_limit)
+        # Many false edges at once can fold the graph up, from where no iteration finds back.
+        graph.restart(T_wk)
         total += graph.run(iterations, is_kept)
         is_kept, more = _snoop(graph, is_robust, is_kept, chi2_limit, iterations)
         total += more

@@ -57,6 +57,14 @@ class Graph:
         self.T_wk = np.array([vertex.estimate().matrix() for vertex in self._vertices])
         return done
 
+    def restart(self, T_wk: np.ndarray) -> None:
+        """Go on from poses `T_wk` (K, 4, 4)."""
+        import g2opy
+
+        self.T_wk = np.array(T_wk, dtype=np.float64)
+        for vertex, T in zip(self._vertices, self.T_wk, strict=True):
+            vertex.set_estimate(g2opy.Isometry3d(T))
+
     def _iterate(self, algorithm, iterations: int) -> tuple[int, bool]:
         """Iterate until the cost changes no more; say whether it is no higher than before, and go back if it is."""
         import g2opy
@@ -70,8 +78,7 @@ class Graph:
             before, cost = cost, self._cost() if self._optimizer.optimize(1) == 1 else np.inf
         is_better = cost <= start * (1.0 + 1e-9) + 1e-9
         if not is_better:
-            for vertex, T in zip(self._vertices, self.T_wk, strict=True):
-                vertex.set_estimate(g2opy.Isometry3d(T))
+            self.restart(self.T_wk)
         return done, is_better
 
     def _cost(self) -> float:

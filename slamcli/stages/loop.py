@@ -67,9 +67,11 @@ def close_loops(builder: MapBuilder, words: Words, camera, cfg, tools) -> list[C
             pair = (candidate.kf_i, candidate.kf_j)
             if are_apart(builder, candidate):
                 continue
-            done = [c for c in fate.values() if c.T_ij is not None]
+            # One closure joins its whole neighbourhood: fusion finds the rest. And where the graph contradicted one, words would only
+            # name its like again; what the poses of now name is another idea.
+            done = [c for c in fate.values() if c.is_accepted or (c.T_ij is not None and not candidate.is_near)]
             if any(closure.is_near(candidate, c, span=cfg.loop.closure_spacing) for c in done):
-                continue  # one closure joins its whole neighbourhood: fusion finds the rest
+                continue
             fate[pair] = closure.verify(builder, words, candidate, camera, cfg.loop, cfg.sensor, rng)
             if fate[pair].is_accepted:
                 new.append(fate[pair])
