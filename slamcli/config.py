@@ -200,7 +200,11 @@ class OctreeConfig(SurfaceConfig):
     """The occupancy octree."""
 
     resolution: float = option(0.05, "leaf side [m]", gt=0, le=10)
-    frames: str = option("key", "whose depth is inserted; with all, moved objects fade sooner", choices=("key", "all"))
+    frames: str = option(
+        "auto",
+        "whose depth is inserted: key frames, all, or key frames and, where these saw something vanish, the frames that look there",
+        choices=("auto", "key", "all"),
+    )
     stride: int = option(4, "every stride-th row and column of a depth image is used", ge=1, le=64)
     max_range: float = option(3.2, "rays are cut off here: a Kinect's noise reaches a third of a cell [m]", gt=0, le=1000)
     hit: float = option(0.7, "probability of a cell in which a ray ends", gt=0.5, lt=1)

@@ -22,7 +22,16 @@ def test_projection_inverts_backprojection(x, y, z):
 def test_undistortion_inverts_distortion_all_over_the_image():
     u, v = np.meshgrid(np.linspace(0, 639, 30), np.linspace(0, 479, 30))
     raw = np.stack([u.ravel(), v.ravel()], axis=1)
-    np.testing.assert_allclose(FREIBURG1.distort(FREIBURG1.undistort(raw)), raw, atol=1e-4)
+    np.testing.assert_allclose(FREIBURG1.distort(FREIBURG1.undistort(raw)), raw, atol=1e-9)
+
+
+def test_pixels_that_no_point_is_mapped_to_stay_numbers():
+    """A polynomial that turns back at radius 0.6: what it cannot reach has no inverse, and must not hang or spread NaN."""
+    camera = Camera(640, 480, 300.0, 300.0, 319.5, 239.5, -1.0)
+    raw = np.array([[319.5, 239.5], [400.0, 300.0], [0.0, 0.0], [639.0, 479.0]])
+    undistorted = camera.undistort(raw)
+    assert np.isfinite(undistorted).all()
+    np.testing.assert_allclose(camera.distort(undistorted[:2]), raw[:2], atol=1e-9)
 
 
 def test_distortion_agrees_with_opencv():

@@ -9,7 +9,7 @@ from slamcli.formats import octomap
 from slamcli.geometry import voxel
 from slamcli.geometry.octree import DEPTH, Octree, prune
 from slamcli.mapping import occupancy
-from slamcli.mapping.occupancy import FREE, OCCUPIED, OccupancyMap, mark_scan
+from slamcli.mapping.occupancy import FREE, OCCUPIED, OccupancyMap, Scan, mark_scan
 
 MODEL = {"hit": 0.7, "miss": 0.4, "clamp_min": 0.1192, "clamp_max": 0.971}
 
@@ -144,12 +144,12 @@ def test_a_map_agrees_with_the_scan_it_was_made_from_and_not_with_its_opposite()
     grid = OccupancyMap(0.05, **MODEL)
     grid.insert(*scan, max_range=4.0)
     tree = prune(grid.leaves())
-    right = occupancy.accuracy(tree, [scan], max_range=4.0)
+    right = occupancy.accuracy(tree, [Scan(*scan)], max_range=4.0)
     assert (right.share, right.unknown) == (1.0, 0)
     assert right.correct == len(grid.leaves())
-    wrong = occupancy.accuracy(Octree(tree.resolution, tree.key, tree.depth, -tree.log_odds), [scan], max_range=4.0)
+    wrong = occupancy.accuracy(Octree(tree.resolution, tree.key, tree.depth, -tree.log_odds), [Scan(*scan)], max_range=4.0)
     assert wrong.share == 0.0
-    nothing = occupancy.accuracy(Octree(0.05, tree.key[:0], tree.depth[:0], tree.log_odds[:0]), [scan], max_range=4.0)
+    nothing = occupancy.accuracy(Octree(0.05, tree.key[:0], tree.depth[:0], tree.log_odds[:0]), [Scan(*scan)], max_range=4.0)
     assert nothing.unknown == right.correct and np.isnan(nothing.share)
 
 

@@ -9,6 +9,7 @@ float, follows its `computeUpdate`, `computeRayKeys` and `updateNodeLogOdds`, so
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import b1, f4, f8, i4, i8, u1, u8
@@ -24,6 +25,14 @@ MAX_MARKS = 1 << 30  # cells of one scan's bounding box, a byte each
 FREE, OCCUPIED = 1, 2  # a scan's marks
 UNTOUCHED, TOUCHED = -1, -2  # blocks of a scan's bounding box, until their row is known
 ROUNDING = 1e-9  # relative; far above what some hundred additions of float64 can lose, far below what a ray's path depends on
+
+
+class Scan(NamedTuple):
+    """What one depth image says of the space around."""
+
+    x: np.ndarray  # (N, 3) end points [m]
+    origin: np.ndarray  # (3,) where the rays start [m]
+    frame: int = 0
 
 
 def log_odds(probability: float) -> np.float32:
@@ -43,15 +52,23 @@ class OccupancyMap:
         """
         self.resolution = float(resolution)
         self._update = log_odds(miss), log_odds(hit), log_odds(clamp_min), log_odds(clamp_max)
-        self._blocks = voxel.VoxelRows(log_odds=((BLOCK_CELLS,), np.float32, np.nan))
+        columns = {"log_odds": (np.float32, np.nan), "misses": (np.uint8, 0), "last_hit": (np.int32, 0)}
+        self._blocks = voxel.VoxelRows(**{name: ((BLOCK_CELLS,), *of) for name, of in columns.items()})
 
-    def insert(self, x_w: np.ndarray, origin: np.ndarray, *, max_range: float, discretise: bool = False) -> None:
+    @property
+    def looks(self) -> int:
+        """Give how many misses make the surest cell free."""
+        miss, _, lowest, highest = self._update
+        return int(np.ceil((highest - max(lowest, 0.0)) / -miss))
+
+    def insert(self, x_w: np.ndarray, origin: np.ndarray, *, max_range: float, discretise: bool = False, frame: int = 0) -> None:
         """Insert one scan.
 
         x_w : (N, 3) end points [m]; one that is not finite is skipped
         origin : (3,) where the rays start [m]
         max_range : farther points only free the space up to this range [m]; 0 = no limit
         discretise : cast one ray per end cell, to its centre, instead of one per point
+        frame : number of the scan, for `doubted`
         """
         marked = mark_scan(x_w, origin, max_range=max_range, resolution=self.resolution, discretise=discretise)
         if marked is None:
@@ -62,8 +79,18 @@ class OccupancyMap:
         blocks = self._blocks
         blocks.reserve(_touch_blocks(rows_of_8, block_row))
         blocks.n = _update_cells(
-            rows_of_8, lower, block_row, blocks.slot_row, blocks.row_key, blocks.n, blocks.columns["log_odds"], *self._update
+            rows_of_8, lower, block_row, blocks.slot_row, blocks.row_key, blocks.n, *blocks.columns.values(), *self._update, frame
         )
+
+    def doubted(self, misses: int) -> tuple[np.ndarray, np.ndarray]:
+        """Find cells that are occupied, but that the last so many scans that touched them saw free.
+
+        Returns their centres (N, 3) [m] and the frame of the last scan that hit each (N,).
+        """
+        columns = {name: column[: self._blocks.n] for name, column in self._blocks.columns.items()}
+        block, local = np.nonzero((columns["log_odds"] > 0.0) & (columns["misses"] >= misses))
+        cell = voxel.unmorton((self._blocks.row_key[block] << 9) + local)
+        return (cell - CENTRE + 0.5) * self.resolution, columns["last_hit"][block, local]
 
     def leaves(self) -> Octree:
         """Give the known cells as an octree that is not pruned."""
@@ -89,15 +116,12 @@ class Accuracy:
         return self.correct / (self.correct + self.wrong) if self.correct + self.wrong else np.nan
 
 
-def accuracy(tree: Octree, scans: Iterable[tuple[np.ndarray, np.ndarray]], *, max_range: float, threshold: float = 0.0) -> Accuracy:
-    """Replay scans against a tree and count the cells whose state agrees, as OctoMap's `eval_octree_accuracy` does.
-
-    scans : (points (N, 3), origin (3,)) in the tree's frame [m]
-    """
+def accuracy(tree: Octree, scans: Iterable[Scan], *, max_range: float, threshold: float = 0.0) -> Accuracy:
+    """Replay scans, given in the tree's frame, and count the cells whose state agrees, as OctoMap's `eval_octree_accuracy` does."""
     is_occupied = tree.is_occupied(threshold)
     correct = wrong = unknown = 0
-    for x_w, origin in scans:
-        marked = mark_scan(x_w, origin, max_range=max_range, resolution=tree.resolution)
+    for scan in scans:
+        marked = mark_scan(scan.x, scan.origin, max_range=max_range, resolution=tree.resolution)
         if marked is None:
             continue
         marks, lower = marked
@@ -361,10 +385,13 @@ def _update_cells(
     row_key: i8[::1],
     n_rows: i8,
     value: f4[:, ::1],
+    misses: u1[:, ::1],
+    last_hit: i4[:, ::1],
     miss: f4,
     hit: f4,
     lowest: f4,
     highest: f4,
+    frame: i8,
 ):
     """Update every marked cell once, (11) and (13) of Zhao et al. with clamping; returns the number of blocks."""
     bx, by, bz = lower[0] >> 3, lower[1] >> 3, lower[2] >> 3
@@ -390,4 +417,8 @@ def _update_cells(
                         old = np.float32(0.0)
                     new = old + (hit if mark == OCCUPIED else miss)
                     value[row, at] = min(max(new, lowest), highest)
+                    if mark == OCCUPIED:
+                        misses[row, at], last_hit[row, at] = 0, frame
+                    elif misses[row, at] < 255:
+                        misses[row, at] += 1
     return n_rows

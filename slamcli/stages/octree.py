@@ -11,28 +11,26 @@ from slamcli.errors import BadFrame
 from slamcli.formats import octomap
 from slamcli.geometry import octree, se3
 from slamcli.geometry.camera import Camera
-from slamcli.mapping import fusion, occupancy
+from slamcli.mapping import changes, fusion
+from slamcli.mapping.occupancy import OccupancyMap, Scan
 from slamcli.parallel import ordered_map
 from slamcli.schema import Ground
 from slamcli.stages.densify import depth_poses
 
 RAYS_APART = 0.3  # cells from end point to end point on a near surface
+ROUNDS = 2  # of asking the frames between: something may stand before what the first were asked about
 
 
 def run(inputs: Any, out: Path, cfg: Any, tools: Any) -> dict:
     """Insert depth images as scans, write `map.ot` and `map.bt`."""
-    dataset, option = inputs.dataset, cfg.octree
-    T_lw = inputs.load(Ground, "densify").T_lw
-    poses = [(frame, T_lw @ T_wc) for frame, T_wc in depth_poses(inputs, frames=option.frames)]
-    grid = occupancy.OccupancyMap(
-        option.resolution, hit=option.hit, miss=option.miss, clamp_min=option.clamp_min, clamp_max=option.clamp_max
-    )
+    option = cfg.octree
+    grid = OccupancyMap(option.resolution, hit=option.hit, miss=option.miss, clamp_min=option.clamp_min, clamp_max=option.clamp_max)
     n_scans = 0
-    for x_l, origin in scans(
-        dataset, inputs.camera(), tools.progress(poses, "octree"), cfg.sensor, option, workers=tools.workers, warn=tools.warn
-    ):
-        grid.insert(x_l, origin, max_range=option.max_range)
-        n_scans += 1
+    for poses in rounds(inputs, grid, option):
+        progress = tools.progress(poses, "octree")
+        for scan in scans(inputs.dataset, inputs.camera(), progress, cfg.sensor, option, workers=tools.workers, warn=tools.warn):
+            grid.insert(scan.x, scan.origin, max_range=option.max_range, frame=scan.frame)
+            n_scans += 1
     cells = grid.leaves()
     tree = octree.prune(cells)
     if not len(tree):
@@ -41,13 +39,29 @@ def run(inputs: Any, out: Path, cfg: Any, tools: Any) -> dict:
     octomap.write_bt(out / "map.bt", tree)
     n_occupied = int(cells.is_occupied().sum())
     return {
-        "frames": len(dataset),
+        "frames": len(inputs.dataset),
         "scans": n_scans,
         "occupied_cells": n_occupied,
         "free_cells": len(cells) - n_occupied,
         "leaves": len(tree),
         "nodes": n_nodes,
     }
+
+
+def rounds(inputs: Any, grid: OccupancyMap, option: OctreeConfig) -> Iterator[list[tuple[int, np.ndarray]]]:
+    """Give the frames to insert next, each with its pose (4, 4) camera to level frame, in the order of time; rounds follow on one another."""
+    T_lw = inputs.load(Ground, "densify").T_lw
+    poses = [(frame, T_lw @ T_wc) for frame, T_wc in depth_poses(inputs, frames="all")]
+    if option.frames == "all":
+        yield poses
+        return
+    chosen = {frame for frame, _ in depth_poses(inputs)}
+    yield [pose for pose in poses if pose[0] in chosen]
+    for _ in range(ROUNDS if option.frames == "auto" else 0):
+        poses = [pose for pose in poses if pose[0] not in chosen]
+        asked = changes.witnesses(grid, poses, inputs.camera(), max_range=option.max_range)
+        chosen = {frame for frame, _ in asked}
+        yield asked
 
 
 def scans(
@@ -59,13 +73,13 @@ def scans(
     *,
     workers: int = 1,
     warn: Callable[[str], None] = lambda message: None,
-) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Read frames' depth, cleaned, as scans: end points (N, 3) and origin (3,) in the frame that the poses lead to.
+) -> Iterator[Scan]:
+    """Read frames' depth, cleaned, as scans in the frame that the poses lead to.
 
     poses : (frame, camera to that frame when its depth was measured); one without depth, or that cannot be read, gives no scan
     """
 
-    def scan(item: tuple[int, np.ndarray]) -> tuple[np.ndarray, np.ndarray] | None:
+    def scan(item: tuple[int, np.ndarray]) -> Scan | None:
         frame, T_lk = item
         try:
             depth = dataset.depth(frame)
@@ -83,6 +97,6 @@ def scans(
             depth_min=sensor.depth_min,
             depth_max=sensor.depth_max,
         )
-        return se3.transform(T_lk, seen.xyz_c.astype(np.float64)), T_lk[:3, 3]
+        return Scan(se3.transform(T_lk, seen.xyz_c.astype(np.float64)), T_lk[:3, 3], frame)
 
     return (item for item in ordered_map(scan, poses, workers=workers) if item is not None)
