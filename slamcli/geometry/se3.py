@@ -96,11 +96,21 @@ def adjoint(T_ab: np.ndarray) -> np.ndarray:
 
 
 def quaternion_xyzw(T: np.ndarray) -> np.ndarray:
-    """Give unit quaternions (..., 4), order x y z w, of the rotations in (..., 4, 4) or (..., 3, 3)."""
-    from scipy.spatial.transform import Rotation
+    """Give unit quaternions (..., 4), order x y z w, of the rotations in (..., 4, 4) or (..., 3, 3).
 
+    From the largest of its four components, which loses no digits: S. Shepperd, Quaternion from rotation matrix, JGC 1978,
+    doi:10.2514/3.55767b
+    """
     R = np.asarray(T, dtype=np.float64)[..., :3, :3]
-    return Rotation.from_matrix(R.reshape(-1, 3, 3)).as_quat().reshape(R.shape[:-2] + (4,))
+    x, y, z = R[..., 0, 0], R[..., 1, 1], R[..., 2, 2]
+    xy, xz, yz = R[..., 1, 0] + R[..., 0, 1], R[..., 0, 2] + R[..., 2, 0], R[..., 2, 1] + R[..., 1, 2]
+    wx, wy, wz = R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]
+    # Rows of 4 q q^T: each is the quaternion times one of its components.
+    rows = [[1.0 + x - y - z, xy, xz, wx], [xy, 1.0 - x + y - z, yz, wy], [xz, yz, 1.0 - x - y + z, wz], [wx, wy, wz, 1.0 + x + y + z]]
+    outer = np.moveaxis(np.array(rows), (0, 1), (-2, -1))
+    largest = np.argmax(np.diagonal(outer, axis1=-2, axis2=-1), axis=-1)
+    q = np.take_along_axis(outer, largest[..., None, None], axis=-2)[..., 0, :]
+    return q / np.linalg.norm(q, axis=-1, keepdims=True)
 
 
 def from_quaternion(position: np.ndarray, quaternion: np.ndarray) -> np.ndarray:
@@ -120,7 +130,12 @@ def orthonormalise(T: np.ndarray) -> np.ndarray:
 
     Every law here, `inverse` first, rests on orthonormal rotations; solvers of polynomials and long products do not keep them so.
     """
-    return from_quaternion(np.asarray(T)[..., :3, 3], quaternion_xyzw(T))
+    T = np.array(T, dtype=np.float64)
+    U, _, Vt = np.linalg.svd(T[..., :3, :3])
+    U[..., 2] *= np.linalg.det(U @ Vt)[..., None]  # a rotation, where the nearest orthonormal matrix were a reflection
+    T[..., :3, :3] = U @ Vt
+    T[..., 3, :] = [0.0, 0.0, 0.0, 1.0]
+    return T
 
 
 def interpolate(T_wa: np.ndarray, T_wb: np.ndarray, alpha: np.ndarray | float) -> np.ndarray:

@@ -123,7 +123,7 @@ class Localiser:
         self.T_kc[i] = se3.inverse(estimate.T_cw @ self.builder.kf.T_wk[kf])
 
     def _initial_pose(self, i: int, frame: FrameFeatures) -> tuple[np.ndarray | None, np.ndarray]:
-        """Guess from the features matched to the previous frame, by P3P in RANSAC; else from the motion before it.
+        """Guess from the features matched to the previous frame: where the motion before it does not explain them, by P3P in RANSAC.
 
         Matches need no motion model, so fast turns do no harm; [Z] 1.2.
         """
@@ -131,23 +131,23 @@ class Localiser:
         if T_wp is None:
             return None, np.empty(0, np.int32)
         rows, x_w, ids = self._inherit(i, T_wp)
-        guesses = [self._predict(i, T_wp)]
+        predicted = self._predict(i, T_wp)
         if len(rows) >= self.settings.min_inliers:
-            start = pose.ransac_p3p(
-                x_w,
-                frame.xy[rows],
-                self.camera,
-                rng=self.rng,
-                rounds=self.settings.ransac_rounds,
-                threshold_px=self.settings.ransac_threshold_px,
-            )
-            if start is not None:
-                guesses.append(start.T_cw)
-            estimates = [estimate_pose(T_cw, x_w, frame, rows, self.camera) for T_cw in guesses]
-            best = max(estimates, key=lambda e: e.n_inliers)
+            best = estimate_pose(predicted, x_w, frame, rows, self.camera)
+            if 2 * best.n_inliers <= len(rows):  # else no other pose can have as many
+                start = pose.ransac_p3p(
+                    x_w,
+                    frame.xy[rows],
+                    self.camera,
+                    rng=self.rng,
+                    rounds=self.settings.ransac_rounds,
+                    threshold_px=self.settings.ransac_threshold_px,
+                )
+                if start is not None:
+                    best = max(best, estimate_pose(start.T_cw, x_w, frame, rows, self.camera), key=lambda e: e.n_inliers)
             if best.n_inliers >= self.settings.min_inliers:
                 return best.T_cw, self._known(i, ids[best.is_inlier])
-        return guesses[0], self._known(i, self._lm_of_previous)
+        return predicted, self._known(i, self._lm_of_previous)
 
     def _known(self, i: int, ids: np.ndarray) -> np.ndarray:
         """Give those of `ids` that still are landmarks; where none is, all that the key frame sees on which the frame before `i` hangs."""
