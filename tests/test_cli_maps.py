@@ -42,6 +42,13 @@ def test_export_octree_gives_the_stages_file(slamcli: Callable, known: RunDir, s
     assert len(octomap.read(out)) > 100
 
 
+def test_export_octree_with_colours_is_the_same_tree(slamcli: Callable, known: RunDir, tmp_path: Path) -> None:
+    assert slamcli("export-octree", tmp_path / "map.ot", "-r", known.path, "--colour").exit_code == 0
+    assert b"id ColorOcTree" in (tmp_path / "map.ot").read_bytes()[:300]
+    ours, plain = octomap.read(tmp_path / "map.ot"), octomap.read(known.stage_path("octree", "map.ot"))
+    assert np.array_equal(ours.key, plain.key) and np.array_equal(ours.log_odds, plain.log_odds)
+
+
 def test_export_mesh_makes_a_surface_of_the_level_frame(slamcli: Callable, known: RunDir, tmp_path: Path) -> None:
     result = slamcli("export-mesh", tmp_path / "mesh.ply", "-r", known.path, "--voxel", 0.05)
     assert result.exit_code == 0 and "triangles" in result.stderr
@@ -63,6 +70,7 @@ def test_render_draws_the_map(slamcli: Callable, known: RunDir, what: str, tmp_p
     [
         (("export-cloud", "cloud.xyz"), "must end in .ply or .pcd"),
         (("export-octree", "map.png"), "must end in .bt or .ot"),
+        (("export-octree", "map.bt", "--colour"), "no room for colours"),
         (("export-mesh", "mesh.obj"), "must end in .ply"),
         (("render", "picture.gif"), "must end in .png or .jpg"),
         (("export-octree", "no/such/folder/map.bt"), "No such file"),

@@ -124,6 +124,31 @@ def test_the_library_reads_our_files_and_writes_the_same_bytes(tree: Octree, fil
         assert from_bt.isNodeOccupied(node) == occupied[i]
 
 
+def test_the_library_finds_our_colours_and_writes_the_same_bytes(tree: Octree, tmp_path: Path) -> None:
+    pyoctomap = pytest.importorskip("pyoctomap", reason="the C++ library, in the extra 'test', is not installed")
+    rng = np.random.default_rng(1)
+    occupied = tree.is_occupied()
+    leaf = np.repeat(np.flatnonzero(occupied)[::2], 3)  # three points in every other occupied leaf, and stray ones
+    xyz = tree.centre[leaf] + rng.uniform(-0.4, 0.4, (len(leaf), 3)) * tree.side[leaf, None]
+    rgb = rng.integers(0, 256, (len(leaf), 3)).astype(np.uint8)
+    stray = np.array([[1e7, 0.0, 0.0], tree.centre[np.flatnonzero(~occupied)[0]]])
+    n = octomap.write_colour_ot(
+        tmp_path / "map.ot", tree, np.vstack([xyz, stray]), np.vstack([rgb, [[9, 9, 9], [9, 9, 9]]]).astype(np.uint8)
+    )
+    theirs = pyoctomap.ColorOcTree(0.1).read(str(tmp_path / "map.ot"))
+    assert theirs.size() == n and theirs.getTreeType() == "ColorOcTree"
+    expected = np.rint(rgb.reshape(-1, 3, 3).mean(axis=1))
+    for k, i in enumerate(np.flatnonzero(occupied)[::2]):
+        node = theirs.search(tree.centre[i])
+        assert tuple(node.getColor()) == tuple(expected[k])
+        assert node.getLogOdds() == tree.log_odds[i]
+    for i in np.concatenate([np.flatnonzero(occupied)[1::2], np.flatnonzero(~occupied)])[::97]:
+        assert tuple(theirs.search(tree.centre[i]).getColor()) == (octomap.NO_COLOUR,) * 3
+    theirs.write(str(tmp_path / "again.ot"))
+    assert (tmp_path / "again.ot").read_bytes() == (tmp_path / "map.ot").read_bytes()
+    assert same(octomap.read(tmp_path / "map.ot"), tree)
+
+
 def test_compare_octrees_finds_no_difference(files: Path, tmp_path: Path) -> None:
     tool = needs_tool("compare_octrees")
     run(needs_tool("convert_octree"), files / "map.ot", tmp_path / "theirs.ot")
@@ -170,7 +195,7 @@ def with_size(data: bytes, size: str) -> bytes:
         (lambda data: b"\x00" * 5000, "not an OctoMap file"),
         (lambda data: data[:60], "no line 'data'"),
         (lambda data: data.replace(b"data\n", b"#" * 9000), "no line 'data'"),
-        (lambda data: data.replace(b"id OcTree", b"id ColorOcTree"), "only OcTree"),
+        (lambda data: data.replace(b"id OcTree", b"id OcTreeStamped"), "only OcTree"),
         (lambda data: data.replace(b"res 0.05", b"res nan"), "res is nan"),
         (lambda data: data.replace(b"res 0.05", b"res -1"), "res is -1"),
         (lambda data: data.replace(b"res 0.05", b"res x"), "not a number"),
@@ -192,6 +217,12 @@ def test_damaged_files_give_one_line_and_little_memory(files: Path, tmp_path: Pa
     tracemalloc.stop()
     assert "\n" not in str(error.value) and str(path) in str(error.value)
     assert peak < 20 * path.stat().st_size + 1_000_000
+
+
+def test_a_tree_without_the_colours_it_claims_is_cut_off(files: Path, tmp_path: Path) -> None:
+    path = damaged(files, tmp_path, "map.ot", lambda data: data.replace(b"id OcTree", b"id ColorOcTree"))
+    with pytest.raises(SlamError, match="cut off"):
+        octomap.read(path)
 
 
 def test_log_odds_that_are_not_finite_are_refused(files: Path, tmp_path: Path) -> None:

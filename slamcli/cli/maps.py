@@ -50,18 +50,32 @@ def export_cloud(out: Path, run: str | None, frame: str) -> None:
 @click.command("export-octree")
 @out_argument
 @run_option
-def export_octree(out: Path, run: str | None) -> None:
+@click.option("--colour", is_flag=True, help="Give occupied leaves the cloud's colours: a ColorOcTree (.ot alone).")
+def export_octree(out: Path, run: str | None, colour: bool) -> None:
     """Write the octree to OUT for OctoMap and octovis: .bt (free or occupied, small) or .ot (with probabilities).
 
     \b
       slamcli export-octree map.bt
+      slamcli export-octree map.ot --colour
     """
     from slamcli.rundir import RunDir
 
-    suffix = _check_suffix(out, ".bt", ".ot")
-    path = RunDir.find(run).stage_path("octree", f"map{suffix}")
-    shutil.copyfile(path, out)
+    suffix, folder = _check_suffix(out, ".bt", ".ot"), RunDir.find(run)
+    if colour:
+        if suffix != ".ot":
+            raise SlamError(f"{out}: a .bt file has no room for colours; write a .ot file, or leave out --colour")
+        _export_colour_octree(out, folder)
+    else:
+        shutil.copyfile(folder.stage_path("octree", f"map{suffix}"), out)
     click.echo(f"{out}: {out.stat().st_size} bytes", err=True)
+
+
+def _export_colour_octree(out: Path, folder: RunDir) -> None:
+    from slamcli.formats import cloud, octomap
+
+    xyz, rgb, _ = cloud.read_ply(folder.stage_path("densify", "cloud.ply"))
+    tree = octomap.read(folder.stage_path("octree", "map.ot"))
+    octomap.write_colour_ot(out, tree, xyz, rgb, parents=folder.config().octree.parents)
 
 
 @click.command("export-mesh")

@@ -1,4 +1,4 @@
-"""OctoMap's files: `.ot` (log-odds of every node) and `.bt` (leaves free or occupied, two bits a child).
+"""OctoMap's files: `.ot` (log-odds of every node, and its colour in a ColorOcTree) and `.bt` (leaves free or occupied, two bits a child).
 
 A text header, `size` counting all nodes, then the nodes depth first. A. Hornung et al., OctoMap, Autonomous Robots 2013,
 doi:10.1007/s10514-012-9321-0, section 4.4; checked against the C++ library.
@@ -10,11 +10,14 @@ from typing import BinaryIO, Literal
 import numpy as np
 
 from slamcli.errors import SlamError
-from slamcli.geometry.octree import DEPTH, Octree, levels, preorder, prune
+from slamcli.geometry import voxel
+from slamcli.geometry.octree import DEPTH, Level, Octree, levels, preorder, prune
 from slamcli.kernels import kernel
 
 MAGIC = {".ot": b"# Octomap OcTree file", ".bt": b"# Octomap OcTree binary file"}
 NODE = np.dtype([("log_odds", "<f4"), ("children", "u1")])
+COLOUR_NODE = np.dtype([("log_odds", "<f4"), ("rgb", "u1", 3), ("children", "u1")])
+NO_COLOUR = 255  # of all three channels, as in OctoMap
 MAX_HEADER = 4096  # bytes; real ones have some 150
 MAX_NODES = 1 << 28  # a tree of 250 million nodes takes 4 GB in memory
 
@@ -29,13 +32,40 @@ FAULT = {
 
 def write_ot(path: Path, tree: Octree, *, parents: Literal["max", "mean"] = "max") -> int:
     """Write the tree with its log-odds; returns the number of nodes."""
+    record, _ = _records(tree, parents, NODE)
+    _write(path, ".ot", tree.resolution, len(record), record)
+    return len(record)
+
+
+def write_colour_ot(path: Path, tree: Octree, xyz: np.ndarray, rgb: np.ndarray, *, parents: Literal["max", "mean"] = "max") -> int:
+    """Write the tree with the mean colour of the points in each occupied node, as a ColorOcTree; returns the number of nodes.
+
+    xyz : (N, 3) [m], in the tree's frame; rgb : (N, 3) uint8
+    """
+    record, nodes = _records(tree, parents, COLOUR_NODE)
+    cell = tree.cells(xyz)
+    inside = ((cell >= 0) & (cell < 1 << DEPTH)).all(axis=1)
+    key = voxel.morton(cell[inside])
+    order = np.argsort(key)
+    key, total = key[order], np.zeros((len(order) + 1, 3), dtype=np.int64)
+    np.cumsum(rgb[inside][order], axis=0, out=total[1:])
+    for depth, (level, place) in enumerate(zip(nodes, preorder(nodes), strict=True)):
+        first, last = (np.searchsorted(key, (level.prefix + k) << 3 * (DEPTH - depth)) for k in (0, 1))
+        has_colour = (last > first) & (level.log_odds >= 0.0)
+        mean = (total[last] - total[first]) / np.maximum(last - first, 1)[:, None]
+        record["rgb"][place] = np.where(has_colour[:, None], np.rint(mean), NO_COLOUR)
+    _write(path, ".ot", tree.resolution, len(record), record, kind="ColorOcTree")
+    return len(record)
+
+
+def _records(tree: Octree, parents: Literal["max", "mean"], dtype: np.dtype) -> tuple[np.ndarray, list[Level]]:
+    """Give all nodes depth first, with log-odds and children filled in, and level by level."""
     nodes = levels(tree, parents=parents)
-    record = np.empty(_n_nodes(nodes), dtype=NODE)
+    record = np.empty(_n_nodes(nodes), dtype=dtype)
     for level, place in zip(nodes, preorder(nodes), strict=True):
         record["log_odds"][place] = level.log_odds
         record["children"][place] = level.children
-    _write(path, ".ot", tree.resolution, len(record), record)
-    return len(record)
+    return record, nodes
 
 
 def write_bt(path: Path, tree: Octree, *, threshold: float = 0.0) -> int:
@@ -58,10 +88,10 @@ def _n_nodes(nodes: list) -> int:
     return int(nodes[0].n_nodes.sum())
 
 
-def _write(path: Path, suffix: str, resolution: float, size: int, data: np.ndarray) -> None:
+def _write(path: Path, suffix: str, resolution: float, size: int, data: np.ndarray, *, kind: str = "OcTree") -> None:
     header = (
         f"{MAGIC[suffix].decode()}\n# (feel free to add / change comments, but leave the first line as it is!)\n#\n"
-        f"id OcTree\nsize {size}\nres {resolution:g}\ndata\n"
+        f"id {kind}\nsize {size}\nres {resolution:g}\ndata\n"
     )
     with open(path, "wb") as file:
         file.write(header.encode())
@@ -71,22 +101,23 @@ def _write(path: Path, suffix: str, resolution: float, size: int, data: np.ndarr
 def read(path: Path) -> Octree:
     """Read a `.ot` or `.bt` file, told apart by its first line; in a `.bt`, log-odds are -2 or 3.5, OctoMap's clamping bounds.
 
-    Raises SlamError for a file that is not what its header says; memory is bounded by the size of the file.
+    Colours are passed over. Raises SlamError for a file that is not what its header says; memory is bounded by the size of the file.
     """
     with open(path, "rb") as file:
-        suffix, size, resolution = _read_header(path, file)
+        suffix, kind, size, resolution = _read_header(path, file)
         data = file.read()
-    n_max = len(data) // NODE.itemsize if suffix == ".ot" else 1 + 4 * len(data)
+    node = COLOUR_NODE if kind == "ColorOcTree" else NODE
+    n_max = len(data) // node.itemsize if suffix == ".ot" else 1 + 4 * len(data)
     if size > min(n_max, MAX_NODES):
         raise SlamError(f"{path}: is cut off: the header says {size} nodes, the data can hold {n_max} at most; write the file again")
     key, depth, log_odds = np.empty(size, np.int64), np.empty(size, np.uint8), np.empty(size, np.float32)
     if size == 0:
         fault, n, n_nodes, used = OK, 0, 0, 0
     elif suffix == ".ot":
-        record = np.frombuffer(data, dtype=NODE, count=len(data) // NODE.itemsize)
+        record = np.frombuffer(data, dtype=node, count=len(data) // node.itemsize)
         value, children = np.ascontiguousarray(record["log_odds"]), np.ascontiguousarray(record["children"])
         fault, n, n_nodes = _parse_ot(value, children, key, depth, log_odds)
-        used = n_nodes * NODE.itemsize
+        used = n_nodes * node.itemsize
     else:
         code = np.frombuffer(data, dtype="<u2", count=len(data) // 2).astype(np.uint16)
         fault, n, n_nodes, used = _parse_bt(code, np.float32(-2.0), np.float32(3.5), key, depth, log_odds)
@@ -99,7 +130,7 @@ def read(path: Path) -> Octree:
     return Octree(resolution, key[:n].copy(), depth[:n].copy(), log_odds[:n].copy())
 
 
-def _read_header(path: Path, file: BinaryIO) -> tuple[str, int, float]:
+def _read_header(path: Path, file: BinaryIO) -> tuple[str, str, int, float]:
     head = file.read(MAX_HEADER)
     first, _, rest = head.partition(b"\n")
     suffix = next((s for s, magic in MAGIC.items() if first.strip() == magic), None)
@@ -119,9 +150,10 @@ def _read_header(path: Path, file: BinaryIO) -> tuple[str, int, float]:
     else:
         raise SlamError(f"{path}: the header has no line 'data' within {MAX_HEADER} bytes; write the file again")
     file.seek(at)
-    if values.get("id") != "OcTree":
-        raise SlamError(f"{path}: holds a tree of type {values.get('id', '(none)')[:40]!r}; only OcTree can be read")
-    return suffix, _number(path, values, "size", int, 0, 1 << 62), _number(path, values, "res", float, 1e-6, 1e6)
+    kind = values.get("id", "(none)")
+    if kind not in ("OcTree", "ColorOcTree"):
+        raise SlamError(f"{path}: holds a tree of type {kind[:40]!r}; only OcTree and ColorOcTree can be read")
+    return suffix, kind, _number(path, values, "size", int, 0, 1 << 62), _number(path, values, "res", float, 1e-6, 1e6)
 
 
 def _number(path: Path, values: dict[str, str], name: str, kind: type, low: float, high: float) -> int | float:
