@@ -103,7 +103,7 @@ class TrackConfig:
     local_key_frames: int = option(20, "key frames whose landmarks are looked for in a frame", ge=1)
     relocalise_candidates: int = option(5, "key frames tried after loss, best word score first", ge=1)
     relocalise_inliers: int = option(45, "landmarks that must agree to recognise a place after loss; as for a closure", ge=4)
-    segment_after: int = option(10, "frames lost in a row, blank ones not counted, after which a new map segment begins; 0 = never", ge=0)
+    segment_after: int = option(10, "frames lost in a row, blank ones not counted, at which a new map segment begins with the first of them; 0 = never", ge=0)
     key_frame_share: float = option(0.6, "a frame that holds less of its reference key frame's landmarks becomes one", gt=0, le=1)
     key_frame_gap: int = option(8, "frames between key frames at most", ge=1)
     key_frame_crowd: int = option(12, "unless so many stand within 0.1 m and 6 degrees of the frame already", ge=1)

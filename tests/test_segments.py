@@ -38,18 +38,25 @@ def apart(tmp_path_factory):
     return run
 
 
-def test_a_jump_into_the_unknown_begins_a_segment_after_the_frames_it_waits(apart):
+def test_a_jump_into_the_unknown_begins_a_segment_with_the_first_frame_after_it(apart):
     tracks, map_ = apart.result("track")
     expected = np.zeros(100, int)
     expected[60:] = 1
-    expected[60 : 60 + TrackConfig().segment_after - 1] = -1
     np.testing.assert_array_equal(frame_segments(tracks, map_), expected)
     assert apart.summary["track"]["segments"] == 2
 
 
+@pytest.mark.parametrize(("n_after", "segments"), [(TrackConfig().segment_after - 1, 1), (TrackConfig().segment_after, 2)])
+def test_a_segment_begins_only_when_enough_frames_were_lost(tmp_path, n_after: int, segments: int):
+    run = Run(scene_of((0.0, 0.4, 60), (0.62, 0.7, n_after)), tmp_path)
+    run.stage(track)
+    assert run.summary["track"]["segments"] == segments
+    assert run.summary["track"]["lost"] == (n_after if segments == 1 else 0)
+
+
 def test_a_segment_never_joined_is_kept_in_its_own_frame_and_told_of(apart):
     tracks, map_ = apart.result("loop")
-    assert apart.summary["loop"]["segments"] == 2 and apart.summary["loop"]["lost"] == 0  # hindsight found the frames waited for
+    assert apart.summary["loop"]["segments"] == 2 and apart.summary["loop"]["lost"] == 0
     for segment, frames in ((0, slice(0, 60)), (1, slice(60, 100))):
         T_wc = frame_poses(tracks, map_, segment)
         assert np.isfinite(T_wc[frames]).all() and np.isnan(np.delete(T_wc, np.r_[frames], axis=0)).all()

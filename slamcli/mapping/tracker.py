@@ -34,6 +34,7 @@ class Tracker(Localiser):
         super().__init__(MapBuilder(features), words, features, words, matches, camera, settings, sensor, rng)
         self.segment = -1  # that frames are added to; -1 before the first
         self._n_lost = 0  # frames in a row that saw enough and were not recognised
+        self._first_lost = -1  # of these
         self._recent = np.empty(0, dtype=np.int32)  # landmarks still on probation
 
     def process(self, i: int) -> None:
@@ -58,10 +59,22 @@ class Tracker(Localiser):
     def _lose(self, i: int, frame: FrameFeatures) -> np.ndarray:
         """Count a lost frame; after too many that could have been recognised, begin a new segment. Returns the landmarks of its features."""
         if len(frame) >= self.settings.min_inliers:
+            self._first_lost = i if self._n_lost == 0 else self._first_lost
             self._n_lost += 1
         if 0 < self.settings.segment_after <= self._n_lost:
-            return self._start_segment(i, frame)
+            return self._begin_again(i)
         return np.full(len(frame), -1, dtype=np.int32)
+
+    def _begin_again(self, last: int) -> np.ndarray:
+        """Begin a new segment with the first lost frame, nearest to what was seen before, and track those after it up to `last` anew."""
+        for i in range(self._first_lost, last + 1):
+            frame = frame_features(self.features, i, self.camera, self.sensor)
+            self._previous, self._lm_of_previous = frame, self._start_segment(i, frame)
+            if self.state[i] == KEY_FRAME:
+                break
+        for later in range(i + 1, last + 1):
+            self.process(later)
+        return self._lm_of_previous
 
     def _start_segment(self, i: int, frame: FrameFeatures) -> np.ndarray:
         """Make frame `i` the first key frame of a new segment if it sees enough with depth."""
