@@ -3,6 +3,7 @@
 from functools import lru_cache
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from slamcli.datasets import open_dataset
 from slamcli.errors import SlamError
@@ -12,6 +13,22 @@ LONGEST_GAP = 0.1  # [s] between true poses across which a pose is interpolated
 SAME_STAMP = 0.002  # [s]
 HIDDEN_SHARE, HIDDEN_BY = 0.05, 0.02  # a point is hidden where the depth read is nearer by this share and this many metres
 GRID = 16  # [px] between the pixels that are carried over to tell how much of a view two frames share
+
+
+def pairs_within(a: np.ndarray, b: np.ndarray, radius: float, octave_a: np.ndarray, octave_b: np.ndarray, *, octaves: float) -> int:
+    """Count pairs of points a (N, 2) and b (M, 2) within `radius` whose octaves differ by at most `octaves`.
+
+    Each point is in one pair at most; the nearest pair comes first, of equals that with the lower rows.
+    """
+    near = cKDTree(a).sparse_distance_matrix(cKDTree(b), radius, output_type="coo_matrix")
+    is_alike = np.abs(octave_a.astype(int)[near.row] - octave_b.astype(int)[near.col]) <= octaves
+    row, column, distance = near.row[is_alike], near.col[is_alike], near.data[is_alike]
+    free_a, free_b, n = np.ones(len(a), dtype=bool), np.ones(len(b), dtype=bool), 0
+    for k in np.lexsort((column, row, distance)):
+        if free_a[row[k]] and free_b[column[k]]:
+            free_a[row[k]] = free_b[column[k]] = False
+            n += 1
+    return n
 
 
 class Recording:

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from slamcli.vision import brief, fast, filters, quadtree
+from slamcli.vision import brief, fast, filters, pyramid, quadtree
 from slamcli.vision.pattern import PAIRS
 
 seeds = st.integers(0, 2**32 - 1)
@@ -21,11 +21,86 @@ def texture(seed: int, height: int, width: int) -> np.ndarray:
     return np.clip(grey, 0, 255).astype(np.uint8)
 
 
+def canvas_of(*images: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Put images one beneath the other on a canvas, in the midst of bytes left over from others; give it and their boxes."""
+    height = [len(image) for image in images]
+    box = np.array([(sum(height[:k]), *image.shape) for k, image in enumerate(images)], dtype=np.int64)
+    canvas = stale(np.empty((sum(height), -(-max(image.shape[1] for image in images) // 8) * 8), np.uint8))
+    for k, image in enumerate(images):
+        pyramid.level(canvas, box, k)[:] = image
+    return canvas, box
+
+
+def stale(canvas: np.ndarray) -> np.ndarray:
+    canvas[:] = np.random.default_rng(99).integers(0, 256, canvas.shape)
+    return canvas
+
+
+def apply(blur, image: np.ndarray) -> np.ndarray:
+    canvas, box = canvas_of(image)
+    out = stale(np.empty_like(canvas))
+    blur(canvas, box, out)
+    return pyramid.level(out, box, 0)
+
+
+def score_of(image: np.ndarray, margin: int = fast.RADIUS) -> np.ndarray:
+    """The score of one level, 0 in its margin."""
+    canvas, box = canvas_of(image)
+    out = np.zeros_like(canvas)
+    fast.corner_score(canvas, box, margin, out)
+    return pyramid.level(out, box, 0)
+
+
+def corners_of(image: np.ndarray, *, border: int = 19, at_most: int = 0, **options) -> fast.Corners:
+    canvas, box = canvas_of(image)
+    return fast.Finder(box, border=border).corners(canvas, at_most=np.array([at_most]), **options)
+
+
 @settings(max_examples=25, deadline=None)
 @given(seeds, st.integers(7, 24), st.integers(7, 40))
 def test_the_fast_score_is_that_of_the_definition(seed: int, height: int, width: int) -> None:
     image = texture(seed, height, width)
-    np.testing.assert_array_equal(fast.corner_score(image, 3), naive.fast_score(image))
+    np.testing.assert_array_equal(score_of(image), naive.fast_score(image))
+
+
+@settings(max_examples=15, deadline=None)
+@given(seeds, st.booleans(), st.sampled_from(["sum", "fast"]))
+def test_levels_on_one_canvas_do_not_touch_each_other(seed: int, bounded: bool, rank_by: str) -> None:
+    rng = np.random.default_rng(seed)
+    images = [texture(seed + k, *rng.integers(39, 80, 2)) for k in range(3)]
+    canvas, box = canvas_of(*images)
+    for blur, edge in ((filters.blur_1px, 2), (filters.blur_2px, 0)):
+        out = stale(np.empty_like(canvas))
+        blur(canvas, box, out)
+        for k, image in enumerate(images):
+            inner = (slice(edge, image.shape[0] - edge), slice(edge, image.shape[1] - edge))
+            np.testing.assert_array_equal(pyramid.level(out, box, k)[inner], apply(blur, image)[inner])
+    options = {"cell": 13, "threshold": 20, "threshold_low": 5, "rank_by": rank_by}
+    at_most, wanted = (20, 3, 9) if bounded else (0, 0, 0), [5, 0, 11]
+    together = fast.Finder(box, border=19).corners(canvas, at_most=np.array(at_most), **options)
+    roots = np.array([(19, top + 19, width - 19, top + height - 19) for top, height, width in box], dtype=np.int32)
+    rows, octave = quadtree.choose(together.xy, together.response, together.first, roots, wanted)
+    for k, image in enumerate(images):
+        alone = corners_of(image, at_most=at_most[k], **options)
+        span = slice(together.first[k], together.first[k + 1])
+        np.testing.assert_array_equal(together.xy[span] - [0, box[k, pyramid.TOP]], alone.xy)
+        np.testing.assert_array_equal(together.response[span], alone.response)
+        expected = spread_of(alone.xy, alone.response, (19, 19, image.shape[1] - 19, image.shape[0] - 19), wanted[k])
+        np.testing.assert_array_equal(rows[octave == k] - together.first[k], expected)
+
+
+def test_memory_used_again_changes_nothing() -> None:
+    """The second image is found as by a finder that never saw the first."""
+    images = [texture(seed, 70, 90) for seed in (1, 3)]
+    options = {"cell": 9, "threshold": 30, "threshold_low": 5, "at_most": np.array([40])}
+    canvas, box = canvas_of(images[0])
+    finder = fast.Finder(box, border=19)
+    finder.corners(canvas, **options)
+    again, fresh = finder.corners(canvas_of(images[1])[0], **options), corners_of(images[1], **{**options, "at_most": 40})
+    assert len(fresh.xy) >= 10
+    np.testing.assert_array_equal(again.xy, fresh.xy)
+    np.testing.assert_array_equal(again.response, fresh.response)
+    np.testing.assert_array_equal(again.summits(np.arange(len(again.xy))), fresh.summits(np.arange(len(fresh.xy))))
 
 
 def hostile() -> dict[str, np.ndarray]:
@@ -48,15 +123,15 @@ def hostile() -> dict[str, np.ndarray]:
 @pytest.mark.parametrize("name", hostile())
 def test_on_hostile_pictures_each_kernel_is_its_twin(name: str) -> None:
     image = hostile()[name]
-    score = fast.corner_score(image, 3)
+    score = score_of(image)
     np.testing.assert_array_equal(score, naive.fast_score(image))
     peak = naive.local_maxima(score, 5)
     for only_best in (False, True):
-        found = fast.corners(image, border=19, cell=7, threshold=40, threshold_low=5, at_most=image.size if only_best else 0)
+        found = corners_of(image, cell=7, threshold=40, threshold_low=5, at_most=image.size if only_best else 0)
         assert [tuple(at) for at in found.xy.tolist()] == naive.cell_corners(peak, 19, 7, 40, only_best)
     places = found.summits(np.arange(len(found.xy)))
     assert np.isfinite(places).all() and (np.abs(places - found.xy) <= 1).all()
-    smooth = filters.blur_2px(image)
+    smooth = apply(filters.blur_2px, image)
     np.testing.assert_array_equal(smooth, cv2.GaussianBlur(image, (7, 7), 2, sigmaY=2, borderType=cv2.BORDER_REFLECT_101))
     xy = np.array([[19, 19], [38, 32], [30, 25], [31, 26]], np.int32)
     angle = brief.orientation(image, xy)
@@ -68,7 +143,7 @@ def test_on_hostile_pictures_each_kernel_is_its_twin(name: str) -> None:
 
 def test_a_margin_leaves_the_inside_as_it_is() -> None:
     image = texture(1, 40, 50)
-    whole, inside = fast.corner_score(image, 3), fast.corner_score(image, 12)
+    whole, inside = score_of(image), score_of(image, 12)
     np.testing.assert_array_equal(inside[12:-12, 12:-12], whole[12:-12, 12:-12])
     inside[12:-12, 12:-12] = 0
     assert not inside.any()
@@ -77,7 +152,7 @@ def test_a_margin_leaves_the_inside_as_it_is() -> None:
 @pytest.mark.parametrize("threshold", [1, 7, 20, 60])
 def test_a_corner_is_where_opencv_finds_one(threshold: int) -> None:
     image = texture(3, 120, 160)
-    score = fast.corner_score(image, 3)
+    score = score_of(image)
     expected = np.zeros(image.shape, dtype=bool)
     for point in cv2.FastFeatureDetector_create(threshold, False).detect(image):
         expected[int(point.pt[1]), int(point.pt[0])] = True
@@ -87,7 +162,7 @@ def test_a_corner_is_where_opencv_finds_one(threshold: int) -> None:
 
 @pytest.mark.parametrize("grey", [0, 128, 255])
 def test_a_constant_image_has_no_corner(grey: int) -> None:
-    found = fast.corners(np.full((90, 120), grey, np.uint8), border=19, cell=30, threshold=20, threshold_low=1)
+    found = corners_of(np.full((90, 120), grey, np.uint8), cell=30, threshold=20, threshold_low=1)
     assert len(found.xy) == len(found.response) == 0
 
 
@@ -95,18 +170,18 @@ def test_a_constant_image_has_no_corner(grey: int) -> None:
 @given(seeds, st.integers(40, 90), st.integers(40, 90), st.sampled_from([7, 30, 200]), st.booleans())
 def test_cells_fall_back_as_the_twin_says(seed: int, height: int, width: int, cell: int, only_best: bool) -> None:
     image, (high, low) = texture(seed, height, width), (25, 5)
-    score = fast.corner_score(image, 3)
+    score = score_of(image)
     peak = naive.local_maxima(score, low)
     room = height * width
     expected = naive.cell_corners(peak, 19, cell, high, only_best)
-    found = fast.corners(image, border=19, cell=cell, threshold=high, threshold_low=low, at_most=room if only_best else 0)
+    found = corners_of(image, cell=cell, threshold=high, threshold_low=low, at_most=room if only_best else 0)
     assert [tuple(at) for at in found.xy.tolist()] == expected
 
 
 def test_the_threshold_rises_until_about_as_many_corners_are_left_as_asked_for() -> None:
     image = texture(12, 240, 320)
-    every = fast.corners(image, border=19, cell=400, threshold=5, threshold_low=5, rank_by="fast")
-    strongest = fast.corners(image, border=19, cell=400, threshold=5, threshold_low=5, at_most=100, rank_by="fast")
+    every = corners_of(image, cell=400, threshold=5, threshold_low=5, rank_by="fast")
+    strongest = corners_of(image, cell=400, threshold=5, threshold_low=5, at_most=100, rank_by="fast")
     assert 100 <= len(strongest.xy) < len(every.xy)
     least = strongest.response.min()
     assert (every.response > least).sum() < 100, "a higher threshold would have left too few"
@@ -115,7 +190,7 @@ def test_the_threshold_rises_until_about_as_many_corners_are_left_as_asked_for()
 
 def test_the_response_is_the_papers_sum() -> None:
     image = texture(5, 100, 100)
-    found = fast.corners(image, border=19, cell=30, threshold=10, threshold_low=5)
+    found = corners_of(image, cell=30, threshold=10, threshold_low=5)
     grey = image.astype(int)
     expected = [sum(abs(grey[y + dy, x + dx] - grey[y, x]) for dx, dy in naive.CIRCLE) for x, y in found.xy]
     np.testing.assert_array_equal(found.response, expected)
@@ -129,8 +204,8 @@ def test_the_summit_follows_a_shift_of_less_than_a_pixel(shift: tuple[float, flo
         turned = np.float32([[0.9, -0.4, 300 + 4 * dx], [0.4, 0.9, -300 + 4 * dy]])
         moved = cv2.warpAffine(tiles, turned, (1280, 960), flags=cv2.INTER_LINEAR)
         image = cv2.resize(cv2.GaussianBlur(moved, (0, 0), 3), (320, 240), interpolation=cv2.INTER_AREA).astype(np.uint8)
-        images.append(filters.blur_1px(image))
-    a, b = (fast.corners(image, border=19, cell=30, threshold=8, threshold_low=5) for image in images)
+        images.append(apply(filters.blur_1px, image))
+    a, b = (corners_of(image, cell=30, threshold=8, threshold_low=5) for image in images)
     apart = (b.xy[None] - a.xy[:, None]).astype(float)
     nearest = np.abs(apart).sum(axis=2).argmin(axis=1)
     whole = apart[np.arange(len(nearest)), nearest]
@@ -139,6 +214,10 @@ def test_the_summit_follows_a_shift_of_less_than_a_pixel(shift: tuple[float, flo
     assert is_same.sum() > 100
     rough, better = (np.sqrt(np.mean((moved[is_same] - shift) ** 2)) for moved in (whole, fine))
     assert 0.0 < better < 0.6 * rough
+
+
+def spread_of(xy: np.ndarray, response: np.ndarray, root: tuple[int, int, int, int], wanted: int) -> np.ndarray:
+    return quadtree.choose(xy, response, np.array([0, len(xy)]), np.array([root], dtype=np.int32), [wanted])[0]
 
 
 points = st.integers(0, 60).flatmap(lambda n: st.tuples(st.just(n), seeds, st.integers(0, 80)))
@@ -154,7 +233,7 @@ def test_the_quadtree_chooses_as_its_twin(case: tuple[int, int, int]) -> None:
     xy = np.stack([place % width, place // width], axis=1).astype(np.int32) + np.int32(19)
     response = rng.integers(0, 8, n).astype(np.float32)  # many equal
     root = (19, 19, 19 + width, 19 + height)
-    chosen = quadtree.choose(xy, response, root, wanted)
+    chosen = spread_of(xy, response, root, wanted)
     assert chosen.tolist() == naive.quadtree(xy.tolist(), response.tolist(), root, wanted)
     assert len(chosen) == min(n, wanted) or n > wanted
 
@@ -166,7 +245,7 @@ def test_the_quadtree_spreads_a_bunch_and_keeps_the_lonely() -> None:
     lonely = np.array([[500, 40], [40, 400], [600, 450]])
     xy = np.concatenate([bunch, lonely]).astype(np.int32)
     response = np.concatenate([np.full(400, 100.0), np.full(3, 1.0)]).astype(np.float32)
-    chosen = quadtree.choose(xy, response, (0, 0, 640, 480), 30)
+    chosen = spread_of(xy, response, (0, 0, 640, 480), 30)
     assert {400, 401, 402} <= set(chosen.tolist())
     assert len(chosen) == 30
 
@@ -175,7 +254,9 @@ def test_the_quadtree_spreads_a_bunch_and_keeps_the_lonely() -> None:
 @given(seeds, st.integers(4, 40), st.integers(4, 40))
 def test_the_wide_blur_is_opencvs_to_the_bit(seed: int, height: int, width: int) -> None:
     image = np.random.default_rng(seed).integers(0, 256, (height, width)).astype(np.uint8)
-    np.testing.assert_array_equal(filters.blur_2px(image), cv2.GaussianBlur(image, (7, 7), 2, sigmaY=2, borderType=cv2.BORDER_REFLECT_101))
+    np.testing.assert_array_equal(
+        apply(filters.blur_2px, image), cv2.GaussianBlur(image, (7, 7), 2, sigmaY=2, borderType=cv2.BORDER_REFLECT_101)
+    )
 
 
 def test_the_narrow_blur_is_the_binomial_rounded() -> None:
@@ -183,7 +264,7 @@ def test_the_narrow_blur_is_the_binomial_rounded() -> None:
     weights = np.array([1, 4, 6, 4, 1])
     exact = cv2.sepFilter2D(image.astype(np.float64), -1, weights, weights, borderType=cv2.BORDER_REFLECT_101)
     inner = (slice(2, -2), slice(2, -2))
-    np.testing.assert_array_equal(filters.blur_1px(image)[inner], np.floor(exact / 256 + 0.5)[inner])
+    np.testing.assert_array_equal(apply(filters.blur_1px, image)[inner], np.floor(exact / 256 + 0.5)[inner])
 
 
 def test_the_disc_is_that_of_opencv() -> None:
@@ -207,7 +288,7 @@ def test_orientation_and_descriptor_are_those_of_the_twins(seed: int) -> None:
     xy = np.stack([rng.integers(19, 51, 6), rng.integers(19, 41, 6)], axis=1).astype(np.int32)
     angle = brief.orientation(image, xy)
     np.testing.assert_allclose(angle, [naive.orientation(image, x, y, brief._disc()) for x, y in xy], atol=1e-6)
-    smooth = filters.blur_2px(image)
+    smooth = apply(filters.blur_2px, image)
     expected = [naive.brief(smooth, x, y, a, PAIRS) for (x, y), a in zip(xy, angle, strict=True)]
     np.testing.assert_array_equal(brief.descriptors(smooth, xy, angle), expected)
 
@@ -220,15 +301,16 @@ def test_descriptors_and_orientations_are_opencvs_on_every_level() -> None:
     for octave in range(4):
         for x, y in np.random.default_rng(octave).integers(40, 130, (40, 2)):
             points.append(cv2.KeyPoint(float(x) * 1.2**octave, float(y) * 1.2**octave, 31.0, 0.0, 1.0, octave))
-    from slamcli.vision import orb
-
-    images = orb.pyramid(grey, levels=8, scale=1.2)
+    box = pyramid.boxes(240, 320, levels=8, scale=1.2, least=1)
+    canvas = pyramid.canvas(box)
+    pyramid.fill(canvas, box, grey)
+    images = [np.ascontiguousarray(pyramid.level(canvas, box, octave)) for octave in range(8)]
     ours = []
     for point in points:
         xy = np.rint(np.array([point.pt]) / 1.2**point.octave).astype(np.int32)
         angle = brief.orientation(images[point.octave], xy)
         point.angle = float(np.rad2deg(angle[0])) % 360
-        ours.append(brief.descriptors(filters.blur_2px(images[point.octave]), xy, angle)[0])
+        ours.append(brief.descriptors(apply(filters.blur_2px, images[point.octave]), xy, angle)[0])
     kept, theirs = plain.compute(grey, points)
     assert len(kept) == len(points)
     order = {(p.pt, p.octave): k for k, p in enumerate(points)}

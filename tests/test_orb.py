@@ -3,10 +3,12 @@
 import cv2
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from test_features import texture
 
 from slamcli.errors import SlamError
-from slamcli.vision import orb
+from slamcli.vision import orb, pyramid
 from slamcli.vision.comparison import evenness, plain_orb, side_by_side
 
 
@@ -22,14 +24,14 @@ def check(points: orb.KeyPoints, grey: np.ndarray, wanted: int) -> None:
 
 
 @pytest.mark.parametrize(
-    "settings", [{}, {"smooth": False, "subpixel": False, "pool": 0, "rank_by": "sum", "threshold": 20, "threshold_low": 7}]
+    "options", [{}, {"smooth": False, "subpixel": False, "pool": 0, "rank_by": "sum", "threshold": 20, "threshold_low": 7}]
 )
-def test_as_many_points_as_wanted_and_the_same_every_time(settings: dict) -> None:
+def test_as_many_points_as_wanted_and_the_same_every_time(options: dict) -> None:
     grey = texture(3, 240, 320)
-    points = orb.detect(grey, features=300, **settings)
+    points = orb.detect(grey, features=300, **options)
     check(points, grey, 300)
     assert len(points) == 300 and len(np.unique(points.octave)) >= 5
-    again = orb.detect(np.asfortranarray(grey), features=300, **settings)
+    again = orb.detect(np.asfortranarray(grey), features=300, **options)
     for name in ("xy", "octave", "angle", "response", "desc"):
         np.testing.assert_array_equal(getattr(points, name), getattr(again, name))
 
@@ -77,10 +79,36 @@ def test_a_levels_pixels_map_back_without_a_shift(octave: int) -> None:
     """A blob drawn at a known place has its centre there on every level."""
     v, u = np.mgrid[0:480, 0:640]
     grey = (255 * np.exp(-((u - 300.4) ** 2 + (v - 210.7) ** 2) / 200)).astype(np.uint8)
-    image = orb.pyramid(grey, levels=8, scale=1.2)[octave].astype(np.float64)
+    box = pyramid.boxes(480, 640, levels=8, scale=1.2, least=1)
+    canvas = pyramid.canvas(box)
+    pyramid.fill(canvas, box, grey)
+    image, top = pyramid.level(canvas, box, octave).astype(np.float64), box[octave, pyramid.TOP]
     y, x = np.mgrid[0 : image.shape[0], 0 : image.shape[1]]
-    centre = np.array([[(image * x).sum(), (image * y).sum()]]) / image.sum()
-    np.testing.assert_allclose(orb.full_size(centre, image, grey), [[300.4, 210.7]], atol=0.05)
+    centre = np.array([[(image * x).sum(), (image * (y + top)).sum()]]) / image.sum()
+    np.testing.assert_allclose(pyramid.full_size(centre, np.array([octave], np.uint8), box), [[300.4, 210.7]], atol=0.05)
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 300), st.integers(0, 300), st.integers(1, 12), st.floats(1.05, 2.0))
+def test_levels_shrink_by_the_scale_and_lie_beneath_each_other(height: int, width: int, levels: int, scale: float) -> None:
+    box = pyramid.boxes(height, width, levels=levels, scale=scale, least=39)
+    assert len(box) <= levels
+    for octave, (top, h, w) in enumerate(box.tolist()):
+        assert top == box[:octave, pyramid.HEIGHT].sum() and min(h, w) >= 39
+        assert abs(h - height / scale**octave) <= 0.5 and abs(w - width / scale**octave) <= 0.5
+    if len(box) < levels:
+        assert min(height, width) / scale ** len(box) < 39.5
+
+
+def test_images_of_other_sizes_between_change_nothing() -> None:
+    """A thread keeps the memory it works in: what the last image left there must not show."""
+    greys = [texture(3, 240, 320), texture(5, 333, 201), np.full((240, 320), 7, np.uint8)]
+    first = orb.detect(greys[0], features=300)
+    for grey in greys[1:]:
+        orb.detect(grey, features=300)
+        again = orb.detect(greys[0], features=300)
+        for name in ("xy", "octave", "angle", "response", "desc"):
+            np.testing.assert_array_equal(getattr(again, name), getattr(first, name))
 
 
 def test_points_come_back_where_a_warp_takes_them() -> None:

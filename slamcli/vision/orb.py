@@ -4,13 +4,14 @@ A pyramid; on each level FAST corners, with a lower threshold in cells that stay
 intensity centroid; rotated BRIEF. E. Rublee et al., ICCV 2011, doi:10.1109/ICCV.2011.6126544
 """
 
+import threading
 from dataclasses import dataclass
+from itertools import accumulate
 
-import cv2
 import numpy as np
 
 from slamcli.errors import SlamError
-from slamcli.vision import brief, fast, filters, quadtree
+from slamcli.vision import brief, fast, filters, pyramid, quadtree
 
 MIN_SIDE = 2 * brief.BORDER + 1  # [px] of a level that can hold a key point
 MAX_SIDE = 16384  # [px]
@@ -52,60 +53,40 @@ def detect(
     An image too small for one key point gives none. Raises SlamError where the array is no 8-bit grey image.
     """
     grey = _checked(grey)
-    images = pyramid(grey, levels=levels, scale=scale)
-    areas = [_usable_area(image) for image in images]
-    corners = [
-        fast.corners(
-            filters.blur_1px(image) if smooth else image,
-            border=brief.BORDER,
-            cell=cell,
-            threshold=threshold,
-            threshold_low=threshold_low,
-            at_most=round(pool * features * area / sum(areas)),
-            rank_by=rank_by,
-        )
-        for image, area in zip(images, areas, strict=True)
-    ]
-    wanted = shares(features, areas, [len(level.xy) for level in corners])
-    found = []
-    for octave, (image, level, n) in enumerate(zip(images, corners, wanted, strict=True)):
-        usable = (brief.BORDER, brief.BORDER, image.shape[1] - brief.BORDER, image.shape[0] - brief.BORDER)
-        rows = quadtree.choose(level.xy, level.response, usable, n)
-        if len(rows) == 0:
-            continue
-        xy = level.xy[rows]
-        angle = brief.orientation(image, xy)
-        desc = brief.descriptors(filters.blur_2px(image), xy, angle)
-        place = full_size(level.summits(rows) if subpixel else xy, image, grey)
-        found.append((place, np.full(len(xy), octave, np.uint8), angle, level.response[rows], desc))
-    return KeyPoints(*(np.concatenate(column) for column in zip(*found, strict=True))) if found else no_key_points()
+    space = _space(grey.shape, levels, scale)
+    box = space.box
+    if len(box) == 0:
+        return no_key_points()
+    pyramid.fill(space.image, box, grey)
+    if smooth:
+        filters.blur_1px(space.image, box, space.blurred)
+    areas = [(height - 2 * brief.BORDER) * (width - 2 * brief.BORDER) for _, height, width in box.tolist()]
+    corners = space.finder.corners(
+        space.blurred if smooth else space.image,
+        cell=cell,
+        threshold=threshold,
+        threshold_low=threshold_low,
+        at_most=np.array([max(round(pool * features * area / sum(areas)), 1) if pool else 0 for area in areas]),
+        rank_by=rank_by,
+    )
+    wanted = shares(features, areas, np.diff(corners.first).tolist())
+    rows, octave = quadtree.choose(corners.xy, corners.response, corners.first, space.roots, wanted)
+    xy = corners.xy.take(rows, axis=0)
+    angle = brief.orientation(space.image, xy)
+    filters.blur_2px(space.image, box, space.blurred)
+    return KeyPoints(
+        xy=pyramid.full_size(corners.summits(rows) if subpixel else xy.astype(np.float64), octave, box),
+        octave=octave,
+        angle=angle,
+        response=corners.response.take(rows),
+        desc=brief.descriptors(space.blurred, xy, angle),
+    )
 
 
 def no_key_points() -> KeyPoints:
     """Give the result for an image without any."""
     none = np.zeros(0, dtype=np.float32)
     return KeyPoints(xy=none.reshape(0, 2), octave=none.astype(np.uint8), angle=none, response=none, desc=np.zeros((0, 32), np.uint8))
-
-
-def pyramid(grey: np.ndarray, *, levels: int, scale: float) -> list[np.ndarray]:
-    """Give the image and its copies, each smaller by `scale`, down to the last that can hold a key point."""
-    images = [grey] if min(grey.shape) >= MIN_SIDE else []
-    for level in range(1, levels):
-        width, height = (round(side / scale**level) for side in (grey.shape[1], grey.shape[0]))
-        if min(width, height) < MIN_SIDE:
-            break
-        images.append(cv2.resize(images[-1], (width, height), interpolation=cv2.INTER_LINEAR_EXACT))
-    return images
-
-
-def full_size(xy: np.ndarray, image: np.ndarray, grey: np.ndarray) -> np.ndarray:
-    """Map pixels of a level to pixels of the full-size image, float32.
-
-    Resizing keeps the outer edges of the corner pixels in place, not their centres: leaving the half pixel out, as cv2.ORB does, would
-    shift the points of level 7 by 1.3 px against those of level 0.
-    """
-    ratio = np.array([grey.shape[1] / image.shape[1], grey.shape[0] / image.shape[0]])
-    return ((xy + 0.5) * ratio - 0.5).astype(np.float32)
 
 
 def shares(features: int, areas: list[float], available: list[int]) -> list[int]:
@@ -117,9 +98,9 @@ def shares(features: int, areas: list[float], available: list[int]) -> list[int]
         total = sum(areas[level] for level in open_levels)
         short = [level for level in open_levels if available[level] <= left * areas[level] / total]
         if not short:
-            bounds = np.rint(left * np.cumsum([0] + [areas[level] for level in open_levels]) / total).astype(int)
-            for level, share in zip(open_levels, np.diff(bounds), strict=True):
-                wanted[level] = int(share)
+            bounds = [round(left * reach / total) for reach in accumulate((areas[level] for level in open_levels), initial=0)]
+            for level, low, high in zip(open_levels, bounds[:-1], bounds[1:], strict=True):
+                wanted[level] = high - low
             break
         for level in short:
             wanted[level] = available[level]
@@ -128,8 +109,29 @@ def shares(features: int, areas: list[float], available: list[int]) -> list[int]
     return wanted
 
 
-def _usable_area(image: np.ndarray) -> int:
-    return (image.shape[0] - 2 * brief.BORDER) * (image.shape[1] - 2 * brief.BORDER)
+class _Space:
+    """The memory in which images of one size are worked on."""
+
+    def __init__(self, box: np.ndarray) -> None:
+        """Reserve it for levels that lie so on their canvas; none at all for none."""
+        self.box = box
+        if len(box):
+            self.image, self.blurred = pyramid.canvas(box), pyramid.canvas(box)
+            self.finder = fast.Finder(box, border=brief.BORDER)
+            top, height, width = box.T
+            sides = [np.full(len(box), brief.BORDER), top + brief.BORDER, width - brief.BORDER, top + height - brief.BORDER]
+            self.roots = np.stack(sides, axis=1).astype(np.int32)
+
+
+_mine = threading.local()
+
+
+def _space(shape: tuple[int, int], levels: int, scale: float) -> _Space:
+    """Give this thread's work space for images of this size: the last one where it fits."""
+    key = (*shape, levels, scale)
+    if getattr(_mine, "key", None) != key:
+        _mine.key, _mine.space = key, _Space(pyramid.boxes(*shape, levels=levels, scale=scale, least=MIN_SIDE))
+    return _mine.space
 
 
 def _checked(grey: np.ndarray) -> np.ndarray:

@@ -1,7 +1,7 @@
-"""The quadtree that spreads key points over the image; [Z] 1.1, steps 4 to 7."""
+"""The quadtree that spreads key points over each level of a pyramid; [Z] 1.1, steps 4 to 7."""
 
 import numpy as np
-from numba import f4, i4, i8
+from numba import f4, i4, i8, u1
 
 from slamcli.kernels import kernel
 
@@ -11,81 +11,127 @@ NONE = -1  # there is no further point
 
 
 @kernel
-def _grow(xy: i4[:, ::1], wanted: i8, node: i4[:, ::1], following: i4[::1], child: i4[:, ::1], rank: i4[::1]):
-    """Split nodes until there are as many as wanted or nothing can split; a split may give up to three too many. Returns their number.
+def _grow(
+    xy: i4[:, ::1],
+    first: i8[::1],
+    root: i4[:, ::1],
+    wanted: i8[::1],
+    node: i4[:, ::1],
+    n_nodes: i8[::1],
+    following: i4[::1],
+    child: i4[:, ::1],
+    rank: i4[::1],
+):
+    """Split the nodes of each level until there are as many as wanted or nothing can split; a split may give up to three too many.
 
     xy : (N, 2) int32 [px]; following : (N,) int32, the next point in the same node
-    node : (wanted + 3, NODE_COLUMNS) int32, row 0 the root with all points; child : (4, 2) int32 and rank : (wanted + 3,) int32, scratch
+    node : (sum of wanted + 3 for each level, NODE_COLUMNS) int32, and n_nodes : (levels,) int64, filled; a level's nodes begin where those
+    of the levels before it would all find room; child : (4, 2) int32 and rank : (rows of node,) int32, scratch
 
     Rounds: every node with more than one point splits in four, the fullest first, of equals the one with the lower row. The first child
     that has points takes its parent's row, the others are appended. One kernel, without calls: each would be compiled and optimised again.
     """
-    n_nodes = 1
-    while n_nodes < wanted:
-        n_before = n_nodes
-        for v in range(n_before):  # insertion sort, as there are a few hundred at most
-            place = v
-            while place > 0 and node[rank[place - 1], COUNT] < node[v, COUNT]:
-                rank[place] = rank[place - 1]
-                place -= 1
-            rank[place] = v
-        if node[rank[0], COUNT] < 2:
-            break
-        for r in range(n_before):
-            v = rank[r]
-            if node[v, COUNT] < 2 or n_nodes >= wanted:
+    base = 0
+    for level in range(len(wanted)):
+        start, end, n = first[level], first[level + 1], base
+        if start < end and wanted[level] > 0:
+            n += 1
+            for side in range(4):
+                node[base, side] = root[level, side]
+            node[base, FIRST], node[base, COUNT] = start, end - start
+            for k in range(start, end):
+                following[k] = k + 1
+            following[end - 1] = NONE
+        while base < n < base + wanted[level]:
+            n_before = n
+            for v in range(base, n_before):  # insertion sort, as there are a few hundred at most
+                place = v
+                while place > base and node[rank[place - 1], COUNT] < node[v, COUNT]:
+                    rank[place] = rank[place - 1]
+                    place -= 1
+                rank[place] = v
+            if node[rank[base], COUNT] < 2:
                 break
-            x0, y0, x1, y1 = node[v, X0], node[v, Y0], node[v, X1], node[v, Y1]
-            x_mid, y_mid = (x0 + x1) >> 1, (y0 + y1) >> 1
-            for c in range(4):
-                child[c, 0], child[c, 1] = NONE, 0
-            k = node[v, FIRST]
-            while k != NONE:
-                c = (xy[k, 0] >= x_mid) + 2 * (xy[k, 1] >= y_mid)
-                after = following[k]
-                following[k], child[c, 0] = child[c, 0], k
-                child[c, 1] += 1
-                k = after
-            for c in range(4):
-                if child[c, 1] > 0:
-                    node[v, X0], node[v, X1] = (x_mid, x1) if c & 1 else (x0, x_mid)
-                    node[v, Y0], node[v, Y1] = (y_mid, y1) if c & 2 else (y0, y_mid)
-                    node[v, FIRST], node[v, COUNT] = child[c, 0], child[c, 1]
-                    v = n_nodes
-                    n_nodes += 1
-            n_nodes -= 1  # the last row made ready was not used
-    return n_nodes
+            for r in range(base, n_before):
+                v = rank[r]
+                if node[v, COUNT] < 2 or n >= base + wanted[level]:
+                    break
+                x0, y0, x1, y1 = node[v, X0], node[v, Y0], node[v, X1], node[v, Y1]
+                x_mid, y_mid = (x0 + x1) >> 1, (y0 + y1) >> 1
+                for c in range(4):
+                    child[c, 0], child[c, 1] = NONE, 0
+                k = node[v, FIRST]
+                while k != NONE:
+                    c = (xy[k, 0] >= x_mid) + 2 * (xy[k, 1] >= y_mid)
+                    after = following[k]
+                    following[k], child[c, 0] = child[c, 0], k
+                    child[c, 1] += 1
+                    k = after
+                for c in range(4):
+                    if child[c, 1] > 0:
+                        node[v, X0], node[v, X1] = (x_mid, x1) if c & 1 else (x0, x_mid)
+                        node[v, Y0], node[v, Y1] = (y_mid, y1) if c & 2 else (y0, y_mid)
+                        node[v, FIRST], node[v, COUNT] = child[c, 0], child[c, 1]
+                        v = n
+                        n += 1
+                n -= 1  # the last row made ready was not used
+        n_nodes[level] = n - base
+        base += wanted[level] + 3
 
 
 @kernel
-def _strongest(node: i4[:, ::1], following: i4[::1], response: f4[::1], chosen: i4[::1]):
-    """Write the point of each node with the largest response, of equals the lowest row. response : (N,) float32, chosen : (nodes,) int32."""
-    for v in range(len(chosen)):
-        best = node[v, FIRST]
-        k = following[best]
-        while k != NONE:
-            if response[k] > response[best] or (response[k] == response[best] and k < best):
-                best = k
-            k = following[k]
-        chosen[v] = best
+def _strongest(
+    response: f4[::1],
+    first: i8[::1],
+    wanted: i8[::1],
+    node: i4[:, ::1],
+    n_nodes: i8[::1],
+    following: i4[::1],
+    is_chosen: u1[::1],
+    chosen: i4[::1],
+    octave: u1[::1],
+):
+    """Choose the strongest point of each leaf, of equals the first; where the last split gave leaves too many, the weakest go.
 
-
-def choose(xy: np.ndarray, response: np.ndarray, root: tuple[int, int, int, int], wanted: int) -> np.ndarray:
-    """Choose at most `wanted` points, evenly spread: one for each leaf of a quadtree, its strongest, of equals the first.
-
-    xy : (N, 2) int32 [px], no point twice; response : (N,) float32; root : x0, y0, x1, y1 of the first node [px], the end excluded
-    Returns increasing rows of xy. Where the last split gave nodes too many, the weakest points go.
+    response : (N,) float32; is_chosen : (N,) uint8, 0; chosen : (sum of wanted,) int32 and octave : uint8, filled. Returns how many.
     """
-    n = len(xy)
-    if n == 0 or wanted <= 0:
-        return np.zeros(0, dtype=np.int32)
-    node = np.empty((wanted + 3, NODE_COLUMNS), dtype=np.int32)
-    node[0] = *root, 0, n
-    following = np.arange(1, n + 1, dtype=np.int32)
-    following[-1] = NONE
-    n_nodes = _grow(xy, wanted, node, following, np.empty((4, 2), dtype=np.int32), np.empty(len(node), dtype=np.int32))
-    chosen = np.empty(n_nodes, dtype=np.int32)
-    _strongest(node, following, response, chosen)
-    for last in range(n_nodes - 1, wanted - 1, -1):
-        chosen[response[chosen[: last + 1]].argmin()] = chosen[last]
-    return np.sort(chosen[:wanted])
+    base, n = 0, 0
+    for level in range(len(wanted)):
+        for v in range(base, base + n_nodes[level]):
+            best = node[v, FIRST]
+            k = following[best]
+            while k != NONE:
+                if response[k] > response[best] or (response[k] == response[best] and k < best):
+                    best = k
+                k = following[k]
+            node[v, FIRST] = best
+            is_chosen[best] = 1
+        end = base + n_nodes[level]
+        while end > base + wanted[level]:
+            weakest, end = base, end - 1
+            for v in range(base, end + 1):
+                if response[node[v, FIRST]] < response[node[weakest, FIRST]]:
+                    weakest = v
+            is_chosen[node[weakest, FIRST]] = 0
+            node[weakest, FIRST] = node[end, FIRST]
+        for k in range(first[level], first[level + 1]):
+            if is_chosen[k]:
+                chosen[n], octave[n] = k, level
+                n += 1
+        base += wanted[level] + 3
+    return n
+
+
+def choose(xy: np.ndarray, response: np.ndarray, first: np.ndarray, root: np.ndarray, wanted: list[int]) -> tuple[np.ndarray, np.ndarray]:
+    """Choose of each level at most `wanted` points, evenly spread: one for each leaf of a quadtree, its strongest, of equals the first.
+
+    xy : (N, 2) int32 [px], no point twice; response : (N,) float32; first : (levels + 1,) int64, row of each level's first point
+    root : (levels, 4) int32, x0, y0, x1, y1 of the first nodes [px], the end excluded
+    Returns increasing rows (M,) int32 of xy and their levels (M,) uint8. Where the last split gave nodes too many, the weakest points go.
+    """
+    goal, room = np.array(wanted, dtype=np.int64), sum(wanted) + 3 * len(wanted)
+    node, n_nodes, following = np.empty((room, NODE_COLUMNS), np.int32), np.empty(len(wanted), np.int64), np.empty(len(xy), np.int32)
+    _grow(xy, first, root, goal, node, n_nodes, following, np.empty((4, 2), np.int32), np.empty(room, np.int32))
+    is_chosen, chosen, octave = np.zeros(len(xy), np.uint8), np.empty(sum(wanted), np.int32), np.empty(sum(wanted), np.uint8)
+    n = _strongest(response, first, goal, node, n_nodes, following, is_chosen, chosen, octave)
+    return chosen[:n], octave[:n]
