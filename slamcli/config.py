@@ -119,9 +119,21 @@ class OptimizeConfig:
 
     enabled: bool = option(True, "false: the map passes through")
     iterations: int = option(30, "rounds of global bundle adjustment at most", ge=1)
-    timing: bool = option(True, "find the colour image's readout time and the depth images' delay, and take both out of the measurements")
-    timing_rounds: int = option(2, "turns of adjusting the map and finding the timing", ge=1, le=10)
+    move_depth: bool = option(True, "move depth readings to the colour image's time with the camera's own motion, by what the stamps say")
+    readout: bool = option(
+        True, "find how long the camera takes to read a colour image, and take the rolling shutter out of the measurements"
+    )
+    depth_delay: bool = option(True, "find by how much depth images are older than their stamps say, and take that out too")
+    intrinsics: bool = option(
+        False,
+        "find focal lengths and principal point: for a camera whose calibration is a guess (4 % off: a tenth of the error); a good one is made worse",
+    )
+    rounds: int = option(2, "turns of adjusting the map and finding those numbers", ge=1, le=10)
     timing_prior: float = option(0.02, "how far from 0 readout time and delay are believed to be before looking [s]", gt=0, le=1)
+    focal_prior: float = option(
+        0.02, "how far focal lengths are believed to be from the recording's calibration, as a share of them", gt=0, le=1
+    )
+    centre_prior: float = option(5.0, "how far the principal point is believed to be from the recording's calibration [px]", gt=0, le=1000)
 
 
 @dataclass(frozen=True)

@@ -61,9 +61,7 @@ class Camera:
     def rays(self) -> np.ndarray:
         """Give per raw pixel the undistorted (x/z, y/z), (height, width, 2) float32: a pixel's point is depth * (x/z, y/z, 1)."""
         u, v = np.meshgrid(np.arange(self.width, dtype=np.float64), np.arange(self.height, dtype=np.float64))
-        xy = self.undistort(np.stack([u.ravel(), v.ravel()], axis=1))
-        normal = (xy - [self.cx, self.cy]) / [self.fx, self.fy]
-        return normal.reshape(self.height, self.width, 2).astype(np.float32)
+        return self.normalise(np.stack([u.ravel(), v.ravel()], axis=1)).reshape(self.height, self.width, 2).astype(np.float32)
 
     def project(self, x_c: np.ndarray) -> np.ndarray:
         """Project points (..., 3) in front of the camera to undistorted pixels (..., 2)."""
@@ -90,11 +88,15 @@ class Camera:
         """
         if not self.is_distorted:
             return np.array(xy, dtype=np.float64)
+        return self.normalise(xy, iterations=iterations) * [self.fx, self.fy] + [self.cx, self.cy]
+
+    def normalise(self, xy: np.ndarray, *, iterations: int = 20) -> np.ndarray:
+        """Give the directions (x/z, y/z), (..., 2), of raw pixels (..., 2)."""
         raw = (np.asarray(xy, dtype=np.float64) - [self.cx, self.cy]) / [self.fx, self.fy]
         normal = raw.copy()
-        for _ in range(iterations):
+        for _ in range(iterations if self.is_distorted else 0):
             normal += raw - self._distort_normal(normal)
-        return normal * [self.fx, self.fy] + [self.cx, self.cy]
+        return normal
 
     def _distort_normal(self, normal: np.ndarray) -> np.ndarray:
         x, y = normal[..., 0], normal[..., 1]

@@ -29,7 +29,7 @@ def run(inputs: Any, out: Path, cfg: Any, tools: Any) -> dict:
     )
     n_scans = 0
     for x_l, origin in scans(
-        dataset, inputs.camera(), tools.progress(poses, "octree"), cfg.sensor, option, workers=tools.workers, warn=tools.warn
+        dataset, inputs.camera("loop"), tools.progress(poses, "octree"), cfg.sensor, option, workers=tools.workers, warn=tools.warn
     ):
         grid.insert(x_l, origin, max_range=option.max_range)
         n_scans += 1
