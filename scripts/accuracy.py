@@ -79,14 +79,12 @@ def measured(recording: str, given: argparse.Namespace) -> list[Result]:
     """Run all variants of a recording."""
     found: list[Result] = []
     for offset, every in itertools.product(given.offsets, given.every):
-        name = f"{Path(recording).name}-{offset}-{every}"
-        folder = rewritten.write(given.out / name / "recording", rewritten.thinned(rewritten.listed(recording), offset, every))
-        features = features_of(folder, given.both, given.out / name / "features")
+        features = features_of(recording, offset, every, given.both, given.out)
         for seed in given.seeds:
             run = features
             for who, changes in (("A", []), ("B", given.change))[: 2 if given.change else 1]:
                 config = replace(config_io.apply(Config(), [*given.both, *changes]), seed=seed)
-                run = variant(run, given.out / name / who, config)
+                run = variant(run, features.path.parent / who, config)
                 found.append(replace(ours(run), recording=Path(recording).name, offset=offset, every=every, who=who))
                 print(line_of(found[-1]), flush=True)
         for k in range(given.rival_runs if given.orbslam3 else 0):
@@ -95,12 +93,14 @@ def measured(recording: str, given: argparse.Namespace) -> list[Result]:
     return found
 
 
-def features_of(recording: Path, assignments: list[str], folder: Path) -> RunDir:
-    """Detect and match features, in a process of its own."""
+def features_of(recording: str, offset: int, every: int, assignments: list[str], out: Path) -> RunDir:
+    """Detect and match features of every n-th frame from a start frame on, in a process of its own."""
+    folder = out / f"{Path(recording).name}-{offset}-{every}"
+    thinned = rewritten.write(folder / "recording", rewritten.thinned(rewritten.listed(recording), offset, every))
     arguments = [word for text in assignments for word in ("-s", text)]
-    command = [sys.executable, "-m", "slamcli", "run", str(recording), "-r", str(folder), "--until", "match", *arguments]
+    command = [sys.executable, "-m", "slamcli", "run", str(thinned), "-r", str(folder / "features"), "--until", "match", *arguments]
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    return RunDir.find(str(folder))
+    return RunDir.find(str(folder / "features"))
 
 
 def variant(source: RunDir, folder: Path, config: Config) -> RunDir:
