@@ -126,7 +126,7 @@ class OptimizeConfig:
     depth_delay: bool = option(True, "find by how much depth images are older than their stamps say, and take that out too")
     intrinsics: bool = option(
         False,
-        "find focal lengths and principal point: for a camera whose calibration is a guess (4 % off: a tenth of the error); a good one is made worse",
+        "find focal lengths and principal point: for a calibration that is a guess (2 % off: a tenth of the error); a good one is made worse",
     )
     rounds: int = option(2, "turns of adjusting the map and finding those numbers", ge=1, le=10)
     timing_prior: float = option(0.02, "how far from 0 readout time and delay are believed to be before looking [s]", gt=0, le=1)

@@ -3,6 +3,7 @@
 import json
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -10,6 +11,7 @@ ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "scripts"))
 
 import ablation  # noqa: E402
+import accuracy  # noqa: E402
 
 from slamcli import config_io  # noqa: E402
 from slamcli.config import Config  # noqa: E402
@@ -54,3 +56,24 @@ def test_a_pair_measured_again_replaces_the_one_before_and_no_other() -> None:
     before = [pair(ON, 0.005, 0.006), pair(OFF, 0.005, 0.006), pair(ON, 0.005, 0.006, seed=1)]
     after = ablation.merged(before, [pair(ON, 0.004, 0.007)])
     assert after == [pair(ON, 0.004, 0.007), *before[1:]]
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        ("optimize.readout=false", accuracy.CHAIN[3:]),
+        ("track.min_inliers=16", accuracy.CHAIN[2:]),
+        ("match.ratio=0.7", accuracy.CHAIN[1:]),
+        ("camera.fx=500", accuracy.CHAIN),
+        ("seed=7", accuracy.STAGES),  # features are the same for every seed
+        ("octree.hit=0.8", ()),
+    ],
+)
+def test_only_what_a_change_concerns_runs_again(change: str, expected: tuple) -> None:
+    run = SimpleNamespace(record=lambda name: {})
+    assert accuracy.to_run(run, Config(), config_io.apply(Config(), [change])) == tuple(expected)
+
+
+def test_a_stage_that_is_not_there_runs_with_all_after_it() -> None:
+    run = SimpleNamespace(record=lambda name: None if name == "optimize" else {})
+    assert accuracy.to_run(run, Config(), Config()) == ("optimize", "loop")

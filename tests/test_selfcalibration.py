@@ -53,7 +53,7 @@ def look(scene: Scene, features: Features, given: Camera, option: OptimizeConfig
     for _ in range(rounds):
         builder.features = selfcalibration.correct(features, given, sensing)
         adjustment.adjust(builder, kfs, sensing.camera, SENSOR, max_iterations=15)
-        sensing = selfcalibration.estimate_sensing(builder, features, given, sensing, SENSOR, prior=prior)
+        sensing = selfcalibration.estimate_sensing(builder, given, sensing, SENSOR, prior=prior)
     return sensing
 
 
@@ -65,6 +65,12 @@ def test_timing_that_was_put_in_is_found_within_its_sigma(scene):
         error = abs(float(getattr(found.timing, name)) - value)
         assert 1e-6 < error < 4.0 * found.sigma[name] and found.sigma[name] < 0.003
     assert set(found.sigma) == set(true) and found.camera == CAMERA
+
+
+def test_what_does_not_differ_from_what_was_believed_stays(scene):
+    found = look(scene, scene.features, CAMERA, OptimizeConfig(intrinsics=True))
+    assert found.camera == CAMERA and found.timing.readout == 0.0 == found.timing.depth_delay
+    assert all(sigma > 0.0 for sigma in found.sigma.values()) and len(found.sigma) == 6
 
 
 def test_intrinsics_that_were_put_in_are_found_within_their_sigma():

@@ -20,6 +20,7 @@ from slamcli.mapping import adjustment, bundle, bundle_kernels, timing
 from slamcli.mapping.mapbuilder import MapBuilder
 from slamcli.schema import Features, Timing
 
+SIGNIFICANT = 3.0  # standard deviations
 STEP = 1e-3  # of its prior sigma, by which an unknown of the calibration is moved to see what that does
 
 
@@ -69,13 +70,11 @@ def recalibrate(features: Features, given: Camera, camera: Camera) -> Features:
     return replace(features, xy=xy)
 
 
-def estimate_sensing(
-    builder: MapBuilder, features: Features, given: Camera, now: Sensing, sensor: SensorConfig, *, prior: dict[str, float]
-) -> Sensing | None:
+def estimate_sensing(builder: MapBuilder, given: Camera, now: Sensing, sensor: SensorConfig, *, prior: dict[str, float]) -> Sensing | None:
     """Find the unknowns at an adjusted map whose features were corrected by `now`.
 
-    features : as measured under the calibration `given`; prior : as `unknowns` gives it, standard deviations around 0 and around `given`
-    Returns better numbers, with the same motion; None where the map is not determined.
+    given : the recording's calibration; prior : as `unknowns` gives it, standard deviations of the timing around 0, of the rest around `given`
+    Returns better numbers, with the same motion, those as before that do not differ significantly; None where the map is not determined.
     """
     part = adjustment.gather(builder, np.arange(len(builder.kf), dtype=np.int32), sensor)
     if len(part.row) == 0 or not prior:
@@ -91,7 +90,10 @@ def estimate_sensing(
     found = estimate(problem, problem.T, problem.x, columns, prior=centre - value, prior_sigma=np.array(list(prior.values())))
     if found is None:
         return None
-    better = dict(zip(names, (value + found.value).tolist(), strict=True))
+    value = value + found.value
+    # What cannot be told from what was believed stays so: the noise of its estimate would go into all measurements for nothing.
+    value = np.where(np.abs(value - centre) > SIGNIFICANT * found.sigma, value, centre)
+    better = dict(zip(names, value.tolist(), strict=True))
     when = {name: np.array(better.pop(name)) for name in ("readout", "depth_delay") if name in better}
     return Sensing(replace(now.camera, **better), replace(now.timing, **when), dict(zip(names, found.sigma.tolist(), strict=True)))
 

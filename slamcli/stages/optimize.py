@@ -43,7 +43,7 @@ def refine(builder: MapBuilder, features: Features, tracks: Tracks, sensing: Sen
     for _ in range(cfg.optimize.rounds if prior else 0):
         builder.features = selfcalibration.correct(features, given, sensing)
         result = adjustment.adjust(builder, kfs, sensing.camera, cfg.sensor, max_iterations=cfg.optimize.iterations)
-        found = selfcalibration.estimate_sensing(builder, features, given, sensing, cfg.sensor, prior=prior)
+        found = selfcalibration.estimate_sensing(builder, given, sensing, cfg.sensor, prior=prior)
         if result is None or found is None:
             break
         twist = timing.frame_twists(features.stamp, tracks, builder.snapshot())
