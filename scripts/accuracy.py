@@ -5,8 +5,8 @@
     python scripts/accuracy.py OUT RECORDING... --offsets 0 1 2 --every 1 3 --seeds 0 1
     python scripts/accuracy.py OUT RECORDING... --orbslam3 ORB/bin/python words.txt --rival-runs 3
 
-A is the default configuration (with what --both sets), B the same with what --change sets; features are detected once for both unless
---change concerns them. A recording starts at frame 0, 1, ... (--offsets) and keeps every n-th frame (--every); both only rewrite its
+A is the default configuration (with what --both sets), B the same with what --change sets; B takes over from A the results of stages that
+the change does not concern. A recording starts at frame 0, 1, ... (--offsets) and keeps every n-th frame (--every); both only rewrite its
 lists. RECORDING is anything that `slamcli run` takes, with a true trajectory. ORB-SLAM3 needs an environment of its own, see orbslam3.py.
 Printed are the APE [m] (RMSE, SE(3), no scale) after each stage, and of all pairs how often B is better, the median of B / A and its
 range. OUT keeps recordings and features, which are used again, and results.json with every figure.
@@ -15,7 +15,7 @@ range. OUT keeps recordings and features, which are used again, and results.json
 import argparse
 import itertools
 import json
-import re
+import os
 import shutil
 import subprocess
 import sys
@@ -32,9 +32,10 @@ from slamcli.console import table
 from slamcli.errors import SlamError
 from slamcli.pipeline import Pipeline
 from slamcli.rundir import RunDir
+from slamcli.stages import stage_named
 
 STAGES = ("track", "optimize", "loop")
-FEATURES = ("extract", "match")
+CHAIN = ("extract", "match", *STAGES)
 
 
 @dataclass(frozen=True)
@@ -78,13 +79,13 @@ def measured(recording: str, given: argparse.Namespace) -> list[Result]:
     """Run all variants of a recording."""
     found: list[Result] = []
     for offset, every in itertools.product(given.offsets, given.every):
-        name = f"{Path(recording).name}-{offset}-{every}"
-        folder = rewritten.write(given.out / name / "recording", rewritten.thinned(rewritten.listed(recording), offset, every))
-        for who, changes in (("A", []), ("B", given.change))[: 2 if given.change else 1]:
-            assignments = [*given.both, *changes]
-            features, config = features_of(folder, assignments, given.out / name), config_io.apply(Config(), assignments)
-            for seed in given.seeds:
-                found.append(replace(ours(features, config, seed), recording=Path(recording).name, offset=offset, every=every, who=who))
+        features = features_of(recording, offset, every, given.both, given.out)
+        for seed in given.seeds:
+            run = features
+            for who, changes in (("A", []), ("B", given.change))[: 2 if given.change else 1]:
+                config = replace(config_io.apply(Config(), [*given.both, *changes]), seed=seed)
+                run = variant(run, features.path.parent / who, config)
+                found.append(replace(ours(run), recording=Path(recording).name, offset=offset, every=every, who=who))
                 print(line_of(found[-1]), flush=True)
         for k in range(given.rival_runs if given.orbslam3 else 0):
             found.append(replace(rival(features, *given.orbslam3), recording=Path(recording).name, offset=offset, every=every, seed=k))
@@ -92,31 +93,44 @@ def measured(recording: str, given: argparse.Namespace) -> list[Result]:
     return found
 
 
-def features_of(recording: Path, assignments: list[str], out: Path) -> RunDir:
-    """Detect and match features, once for all configurations that set the same of them."""
-    chosen = [text for text in assignments if text.split(".")[0] in FEATURES]
-    folder = out / "-".join(["features", *(re.sub(r"[^a-z0-9.=]+", "_", text) for text in chosen)])
-    arguments = [word for text in chosen for word in ("-s", text)]
-    command = [sys.executable, "-m", "slamcli", "run", str(recording), "-r", str(folder), "--until", "match", *arguments]
+def features_of(recording: str, offset: int, every: int, assignments: list[str], out: Path) -> RunDir:
+    """Detect and match features of every n-th frame from a start frame on, in a process of its own."""
+    folder = out / f"{Path(recording).name}-{offset}-{every}"
+    thinned = rewritten.write(folder / "recording", rewritten.thinned(rewritten.listed(recording), offset, every))
+    arguments = [word for text in assignments for word in ("-s", text)]
+    command = [sys.executable, "-m", "slamcli", "run", str(thinned), "-r", str(folder / "features"), "--until", "match", *arguments]
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    return RunDir.find(str(folder))
+    return RunDir.find(str(folder / "features"))
 
 
-def ours(features: RunDir, config: Config, seed: int) -> Result:
-    """Track, optimize and close loops on features that are there, and give the error after each."""
-    folder = features.path.parent / "run"
+def variant(source: RunDir, folder: Path, config: Config) -> RunDir:
+    """Make a run anew under another configuration; what the change does not concern is taken over from `source`."""
     shutil.rmtree(folder, ignore_errors=True)
-    shutil.copytree(features.path, folder)
+    shutil.copytree(source.path, folder, copy_function=os.link)  # stages replace their folders, so that no file is written twice
     run = RunDir.find(str(folder))
-    config = replace(config, seed=seed)
     with run.lock():
+        before = run.config()
         run.write_config(config)
-        for stage in STAGES:
+        for stage in to_run(run, before, config):
             Pipeline(run, config).run_alone(stage)
+    return run
+
+
+def to_run(run: RunDir, before: Config, after: Config) -> tuple[str, ...]:
+    """Name the stages that are not there yet or that a change of configuration concerns, and those after them."""
+    for k, name in enumerate(CHAIN):
+        is_seeded = name in STAGES and before.seed != after.seed
+        if is_seeded or run.record(name) is None or any(getattr(before, s) != getattr(after, s) for s in stage_named(name).config):
+            return CHAIN[k:]
+    return ()
+
+
+def ours(run: RunDir) -> Result:
+    """Give the error after each stage of a run."""
     told = {stage: rivals.accuracy(run, evaluate.stage_trajectory(run, stage)) for stage in STAGES}
     errors = {stage: float("nan") if f["ape"] is None else f["ape"] for stage, f in told.items()}
     cpu = sum(run.record(stage)["cpu_seconds"] - run.record(stage)["compile_seconds"] for stage in STAGES)
-    return Result("", 0, 1, seed, "", errors, told["loop"]["coverage"], 1e3 * cpu / rivals.n_frames(run))
+    return Result("", 0, 1, run.config().seed, "", errors, told["loop"]["coverage"], 1e3 * cpu / rivals.n_frames(run))
 
 
 def rival(run: RunDir, python: str, words: str) -> Result:

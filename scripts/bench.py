@@ -211,14 +211,14 @@ def markdown(rows: list[list[str]]) -> str:
     return "\n".join([lines[0], "|---" * len(rows[0]) + "|", *lines[1:]])
 
 
-def put_into(path: Path, text: str) -> None:
+def put_into(path: Path, text: str, marks: tuple[str, str] = MARKS) -> None:
     """Replace what stands between the marks."""
-    whole = path.read_text(encoding="utf-8")
-    before, found, rest = whole.partition(MARKS[0])
-    _, end, after = rest.partition(MARKS[1])
+    start, stop = marks
+    before, found, rest = path.read_text(encoding="utf-8").partition(start)
+    _, end, after = rest.partition(stop)
     if not (found and end):
-        raise SlamError(f"{path}: there is no {MARKS[0]} ... {MARKS[1]}")
-    path.write_text(f"{before}{MARKS[0]}\n{text}\n{MARKS[1]}{after}", encoding="utf-8")
+        raise SlamError(f"{path}: there is no {start} ... {stop}")
+    path.write_text(f"{before}{start}\n{text}\n{stop}{after}", encoding="utf-8")
 
 
 def slower(found: list[dict[str, Any]], baseline: list[dict[str, Any]]) -> list[str]:

@@ -3,10 +3,11 @@
 
     slamcli vocab export words.txt
     pip install pyorbslam3 opencv-python-headless        (an environment of its own: it needs nothing of slamcli)
-    python scripts/orbslam3.py words.txt RUN [--out trajectory.txt]
+    python scripts/orbslam3.py words.txt RUN [--out trajectory.txt] [--pace 1.0]
 
 RUN is a run directory of slamcli: its extract/frames.txt and extract/camera.json say which images go together, and its run.json where
-they are. Frames are handed over at the pace of their stamps, as its own examples do, since mapping goes on in other threads meanwhile.
+they are. Frames are handed over at the pace of their stamps, as its own examples do, since mapping goes on in other threads meanwhile: on
+a machine that is busy with something else, a lower --pace gives mapping the time it needs.
 The wheel is linked against libGL and libGLEW even without a window (Debian: libgl1 libglew2.2 libegl1).
 The last line on standard output is a JSON object: frames, tracked, cpu_seconds and decode_cpu_seconds of the whole, wall seconds.
 """
@@ -62,8 +63,8 @@ def as_decimals(camera: dict) -> dict:
     return {name: int(value) if name in ("width", "height") else f"{float(value):.9f}" for name, value in camera.items()}
 
 
-def track(slam, root: Path, lines: list[list[str]]) -> dict:
-    """Hand over every frame that has depth; give counts and times."""
+def track(slam, root: Path, lines: list[list[str]], pace: float) -> dict:
+    """Hand over every frame that has depth, at a multiple of the recording's pace; give counts and times."""
     n_tracked, decoding, points, start = 0, 0.0, [], time.perf_counter()
     first = float(lines[0][0])
     for stamp, colour, *depth in lines:
@@ -71,7 +72,7 @@ def track(slam, root: Path, lines: list[list[str]]) -> dict:
         rgb = cv2.cvtColor(cv2.imread(str(root / colour)), cv2.COLOR_BGR2RGB)
         raw = cv2.imread(str(root / depth[-1]), cv2.IMREAD_UNCHANGED) if len(depth) == 2 else np.zeros(rgb.shape[:2], np.uint16)
         decoding += time.thread_time() - before
-        time.sleep(max(0.0, float(stamp) - first - (time.perf_counter() - start)))
+        time.sleep(max(0.0, (float(stamp) - first) / pace - (time.perf_counter() - start)))
         result = slam.track_rgbd(rgb, raw, float(stamp))
         n_tracked += bool(result.pose_valid)
         points.append(result.num_tracked_points)
@@ -84,6 +85,7 @@ def main() -> None:
     parser.add_argument("vocabulary", type=Path)
     parser.add_argument("run", type=Path)
     parser.add_argument("--out", type=Path, help="where to write its final trajectory, in the TUM format")
+    parser.add_argument("--pace", type=float, default=1.0, help="multiple of the pace at which the recording was taken")
     arguments = parser.parse_args()
     import pyorbslam3
 
@@ -95,7 +97,7 @@ def main() -> None:
         settings.flush()
         slam = pyorbslam3.Slam(arguments.vocabulary, settings.name, pyorbslam3.Sensor.RGBD)
         cpu, wall = time.process_time(), time.perf_counter()
-        found = track(slam, root, lines)
+        found = track(slam, root, lines, arguments.pace)
         slam.shutdown()
         found |= {"cpu_seconds": time.process_time() - cpu, "wall_seconds": time.perf_counter() - wall}
         if arguments.out:

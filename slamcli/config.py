@@ -103,7 +103,9 @@ class TrackConfig:
     local_key_frames: int = option(20, "key frames whose landmarks are looked for in a frame", ge=1)
     relocalise_candidates: int = option(5, "key frames tried after loss, best word score first", ge=1)
     relocalise_inliers: int = option(45, "landmarks that must agree to recognise a place after loss; as for a closure", ge=4)
-    segment_after: int = option(10, "frames lost in a row, blank ones not counted, at which a new map segment begins with the first of them; 0 = never", ge=0)
+    segment_after: int = option(
+        10, "frames lost in a row, blank ones not counted, at which a new map segment begins with the first of them; 0 = never", ge=0
+    )
     key_frame_share: float = option(0.6, "a frame that holds less of its reference key frame's landmarks becomes one", gt=0, le=1)
     key_frame_gap: int = option(8, "frames between key frames at most", ge=1)
     key_frame_crowd: int = option(12, "unless so many stand within 0.1 m and 6 degrees of the frame already", ge=1)
@@ -119,9 +121,21 @@ class OptimizeConfig:
 
     enabled: bool = option(True, "false: the map passes through")
     iterations: int = option(30, "rounds of global bundle adjustment at most", ge=1)
-    timing: bool = option(True, "find the colour image's readout time and the depth images' delay, and take both out of the measurements")
-    timing_rounds: int = option(2, "turns of adjusting the map and finding the timing", ge=1, le=10)
+    move_depth: bool = option(True, "move depth readings to the colour image's time with the camera's own motion, by what the stamps say")
+    readout: bool = option(
+        True, "find how long the camera takes to read a colour image, and take the rolling shutter out of the measurements"
+    )
+    depth_delay: bool = option(True, "find by how much depth images are older than their stamps say, and take that out too")
+    intrinsics: bool = option(
+        False,
+        "find focal lengths and principal point: for a calibration that is a guess (2 % off: a tenth of the error); a good one is made worse",
+    )
+    rounds: int = option(2, "turns of adjusting the map and finding those numbers", ge=1, le=10)
     timing_prior: float = option(0.02, "how far from 0 readout time and delay are believed to be before looking [s]", gt=0, le=1)
+    focal_prior: float = option(
+        0.02, "how far focal lengths are believed to be from the recording's calibration, as a share of them", gt=0, le=1
+    )
+    centre_prior: float = option(5.0, "how far the principal point is believed to be from the recording's calibration [px]", gt=0, le=1000)
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ def octree_accuracy(run: RunDir, *, progress: Progress) -> dict[str, Any]:
     tree, config = octomap.read(run.stage_path("octree", "map.ot")), run.config()
     T_lw = run.load(Ground, "densify").T_lw
     poses = [(frame, T_lw @ T_wk) for frame, T_wk in depth_poses(run, frames="key")]
-    replay = scans(run.dataset(), run.camera(), progress(poses, "eval map"), config.sensor, config.octree, workers=config.run.workers)
+    replay = scans(run.dataset(), run.camera("loop"), progress(poses, "eval map"), config.sensor, config.octree, workers=config.run.workers)
     found = occupancy.accuracy(tree, replay, max_range=config.octree.max_range)
     share = float(found.share) if np.isfinite(found.share) else None
     return {"accuracy": share, "correct": found.correct, "wrong": found.wrong, "unknown": found.unknown, "scans": len(poses)}

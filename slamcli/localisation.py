@@ -11,9 +11,10 @@ import numpy as np
 from slamcli.config import Config
 from slamcli.datasets import Dataset
 from slamcli.errors import SlamError
-from slamcli.mapping import hindsight, timing
+from slamcli.mapping import hindsight, selfcalibration, timing
 from slamcli.mapping.localiser import Localiser
 from slamcli.mapping.mapbuilder import MapBuilder
+from slamcli.mapping.selfcalibration import Sensing
 from slamcli.pipeline import Pipeline
 from slamcli.rundir import RunDir
 from slamcli.schema import LOST, Features, Map, Matches, Timing, Tracks, Trajectory, Words, trajectory
@@ -57,8 +58,13 @@ def localise(run: RunDir, recording: Dataset, *, progress: Progress) -> Localise
 
 def _find(run: RunDir, new: RunDir, config: Config, progress: Progress) -> Localised:
     map_, when = run.load(Map, "loop"), run.load(Timing, "loop")
-    builder = MapBuilder.from_map(timing.rectify(run.load(Features, "extract"), when, run.camera()), map_)
-    features, camera = new.load(Features, "extract"), new.camera()
+    given, camera = run.camera(), run.camera("loop")
+    builder = MapBuilder.from_map(selfcalibration.correct(run.load(Features, "extract"), given, Sensing(camera, when, {})), map_)
+    features = new.load(Features, "extract")
+    if new.camera() == given:  # the same camera: what the run found of it holds here too
+        features = selfcalibration.recalibrate(features, given, camera)
+    else:
+        camera = new.camera()
     localiser = Localiser(
         builder,
         run.load(Words, "match"),

@@ -71,10 +71,9 @@ class Inputs:
 
         return artifacts.load(cls, self._run.path / self._declared(stage))
 
-    def camera(self) -> "Camera":
-        """Give the intrinsics that extract used."""
-        self._declared("extract")
-        return self._run.camera()
+    def camera(self, stage: str = "extract") -> "Camera":
+        """Give the intrinsics that extract used, or those known after optimize or loop."""
+        return self._run.camera(self._declared(stage))
 
     def path(self, stage: str, *names: str) -> Path:
         """Name a file that `stage` wrote."""

@@ -127,11 +127,11 @@ class RunDir:
             raise SlamError(f"{root}: the recording is not there any more; put it back, or: slamcli run TARGET -r {self.path}")
         return open_dataset(root, camera=dict((config or self.config()).camera) or None)
 
-    def camera(self) -> "Camera":
-        """Read the intrinsics that extract used."""
+    def camera(self, stage: str = "extract") -> "Camera":
+        """Read the intrinsics that extract used, or those known after optimize or loop."""
         from slamcli.geometry.camera import Camera
 
-        path = self.stage_path("extract", "camera.json")
+        path = self.stage_path(stage, "camera.json")
         return Camera.from_dict(read_json(path), source=str(path))
 
     # what a stage left

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-FORMAT = 2  # of everything a run directory holds; raised whenever an array changes its meaning
+FORMAT = 3  # of everything a run directory holds; raised whenever an array changes its meaning
 
 
 def array(dtype: str, shape: str, meaning: str) -> Any:
@@ -93,7 +93,9 @@ class Timing:
     readout: np.ndarray = array(
         "f8", "", "s, between the first and the last row of a colour image; 0 = global shutter; the stamp is the middle row's"
     )
-    depth_delay: np.ndarray = array("f8", "", "s, by which depth images were taken later than their stamps say")
+    depth_delay: np.ndarray = array(
+        "f8", "", "s, by which depth images were taken later than their stamps say; NaN = depth is not moved to the colour stamp"
+    )
     twist: np.ndarray = array("f8", "F 6", "m/s, rad/s, motion of each frame's camera in its own frame")
 
 

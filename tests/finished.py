@@ -79,7 +79,7 @@ def make(folder: Path, *, seed: int = 0, frames: int = 90, n_lost: int = 6, with
         with run.writing(stage.name) as out:
             for value in results.get(stage.name, ()):
                 artifacts.save(value, out)
-            if stage.name == "extract":
+            if stage.name in ("extract", "optimize", "loop"):
                 (out / "camera.json").write_text((recording / "camera.json").read_text())
             if stage.name == "densify":
                 write_ply(out / "cloud.ply", *_cloud(rng))

@@ -7,6 +7,8 @@ from scenes import CAMERA
 
 from slamcli import artifacts
 from slamcli.config import LoopConfig, OptimizeConfig, SensorConfig, TrackConfig
+from slamcli.files import read_json
+from slamcli.geometry.camera import Camera
 from slamcli.schema import Features, Map, Matches, Tracks, Words
 
 SENSOR = SensorConfig(pixel_noise=0.5)
@@ -15,17 +17,21 @@ SENSOR = SensorConfig(pixel_noise=0.5)
 class Run:
     """The stages from track to loop on a scene, as the pipeline would call them."""
 
-    def __init__(self, scene, folder, **loop_settings):
-        self.scene, self.folder, self.warnings = scene, folder, []
-        self.cfg = SimpleNamespace(track=TrackConfig(), sensor=SENSOR, optimize=OptimizeConfig(), loop=LoopConfig(**loop_settings))
+    def __init__(self, scene, folder, *, given=CAMERA, optimize=None, **loop_settings):
+        self.scene, self.folder, self.given, self.warnings = scene, folder, given, []
+        optimize = optimize or OptimizeConfig()
+        self.cfg = SimpleNamespace(track=TrackConfig(), sensor=SENSOR, optimize=optimize, loop=LoopConfig(**loop_settings))
         self.warn, self.summary = self.warnings.append, {}
 
     def load(self, cls, stage):
         given = {Features: self.scene.features, Words: self.scene.words, Matches: self.scene.matches}
         return given[cls] if cls in given else artifacts.load(cls, self.folder / stage)
 
-    def camera(self):
-        return CAMERA
+    def camera(self, stage="extract"):
+        if stage == "extract":
+            return self.given
+        path = self.folder / stage / "camera.json"
+        return Camera.from_dict(read_json(path), source=str(path))
 
     def rng(self):
         return np.random.default_rng(0)

@@ -182,7 +182,7 @@ class Inputs:
     def load(self, cls, stage):
         return self._values[cls]
 
-    def camera(self):
+    def camera(self, stage="extract"):
         return KINECT
 
     def path(self, stage, *names):

@@ -54,7 +54,7 @@ class Inputs:
         self._records[Features].depth_stamp = self._records[Features].depth_stamp - seconds
         self._records[Timing] = replace(self._records[Timing], depth_delay=np.array(seconds))
 
-    def camera(self):
+    def camera(self, stage: str = "extract"):
         return self.dataset.camera
 
     def load(self, cls: type, stage: str):

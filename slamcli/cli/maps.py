@@ -100,7 +100,7 @@ def export_mesh(out: Path, run: str | None, voxel: float) -> None:
 
     _check_suffix(out, ".ply")
     folder = RunDir.find(run)
-    config, camera, T_lw = folder.config(), folder.camera(), folder.load(Ground, "densify").T_lw
+    config, camera, T_lw = folder.config(), folder.camera("loop"), folder.load(Ground, "densify").T_lw
     option = replace(config.densify, method="tsdf", voxel=voxel)
     poses = console.progress(densify.depth_poses(folder), "mesh")
     volume = Volume(camera, voxel=voxel, depth_max=option.depth_max)

@@ -61,9 +61,7 @@ class Camera:
     def rays(self) -> np.ndarray:
         """Give per raw pixel the undistorted (x/z, y/z), (height, width, 2) float32: a pixel's point is depth * (x/z, y/z, 1)."""
         u, v = np.meshgrid(np.arange(self.width, dtype=np.float64), np.arange(self.height, dtype=np.float64))
-        xy = self.undistort(np.stack([u.ravel(), v.ravel()], axis=1))
-        normal = (xy - [self.cx, self.cy]) / [self.fx, self.fy]
-        return normal.reshape(self.height, self.width, 2).astype(np.float32)
+        return self.normalise(np.stack([u.ravel(), v.ravel()], axis=1)).reshape(self.height, self.width, 2).astype(np.float32)
 
     def project(self, x_c: np.ndarray) -> np.ndarray:
         """Project points (..., 3) in front of the camera to undistorted pixels (..., 2)."""
@@ -87,12 +85,18 @@ class Camera:
         """Map raw pixels (..., 2) to undistorted pixels (..., 2)."""
         if not self.is_distorted:
             return np.array(xy, dtype=np.float64)
+        return self.normalise(xy) * [self.fx, self.fy] + [self.cx, self.cy]
+
+    def normalise(self, xy: np.ndarray) -> np.ndarray:
+        """Give the directions (x/z, y/z), (..., 2), of raw pixels (..., 2)."""
+        raw = (np.asarray(xy, dtype=np.float64) - [self.cx, self.cy]) / [self.fx, self.fy]
+        if not self.is_distorted:
+            return raw
         from slamcli.geometry import lens  # numba takes a third of a second to load
 
-        raw = (np.asarray(xy, dtype=np.float64) - [self.cx, self.cy]) / [self.fx, self.fy]
         normal = np.empty_like(raw)
         lens.undistort(np.ascontiguousarray(raw).reshape(-1, 2), self.k1, self.k2, self.k3, self.p1, self.p2, normal.reshape(-1, 2))
-        return normal * [self.fx, self.fy] + [self.cx, self.cy]
+        return normal
 
     def _distort_normal(self, normal: np.ndarray) -> np.ndarray:
         x, y = normal[..., 0], normal[..., 1]

@@ -6,17 +6,22 @@ of key frames and landmarks and C = J_map^T w J, eliminating the map leaves
     (J^T w J - C^T H^-1 C) g = J^T w r - C^T H^-1 J_map^T w r
 
 which is small, and whose inverse is the covariance of g.
+
+A factor on all depth readings is no such number: a world, a path and depths that are all stretched alike show the same pictures.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from slamcli.config import SensorConfig
+from slamcli.config import OptimizeConfig, SensorConfig
 from slamcli.geometry.camera import Camera
 from slamcli.mapping import adjustment, bundle, bundle_kernels, timing
 from slamcli.mapping.mapbuilder import MapBuilder
 from slamcli.schema import Features, Timing
+
+SIGNIFICANT = 3.0  # standard deviations
+STEP = 1e-3  # of its prior sigma, by which an unknown of the calibration is moved to see what that does
 
 
 @dataclass(frozen=True)
@@ -27,28 +32,99 @@ class Shared:
     sigma: np.ndarray  # (G,) standard deviations
 
 
-def estimate_timing(
-    builder: MapBuilder, features: Features, now: Timing, camera: Camera, sensor: SensorConfig, *, prior_sigma: np.ndarray
-) -> tuple[Timing, np.ndarray] | None:
-    """Find the readout time and the depth delay at an adjusted map whose features were rectified by `now`.
+@dataclass(frozen=True)
+class Sensing:
+    """Where and when the camera measures, and how sure that is."""
 
-    features : as measured; prior_sigma : (2,) [s] of readout and depth delay around 0
-    Returns the better timing, with the same motion, and the standard deviations (2,) [s]; None where the map is not determined.
+    camera: Camera
+    timing: Timing
+    sigma: dict[str, float]  # of the numbers that were found, by name; before looking, how far they are believed to be off
+
+
+def unknowns(camera: Camera, option: OptimizeConfig) -> dict[str, float]:
+    """Give the numbers to be found, fields of Timing or Camera, and how far each is believed to be from what the recording says."""
+    prior = {}
+    if option.readout:
+        prior["readout"] = option.timing_prior
+    if option.move_depth and option.depth_delay:
+        prior["depth_delay"] = option.timing_prior
+    if option.intrinsics:
+        prior |= {"fx": option.focal_prior * camera.fx, "fy": option.focal_prior * camera.fy}
+        prior |= {"cx": option.centre_prior, "cy": option.centre_prior}
+    return prior
+
+
+def correct(features: Features, given: Camera, sensing: Sensing) -> Features:
+    """Give features, measured under the calibration `given`, as they are under what is known of the camera now."""
+    return timing.rectify(recalibrate(features, given, sensing.camera), sensing.timing, sensing.camera)
+
+
+def recalibrate(features: Features, given: Camera, camera: Camera) -> Features:
+    """Give features, measured under the calibration `given`, as they are under another one of the same camera."""
+    if camera == given:
+        return features
+    xy = np.empty_like(features.xy)
+    for start in range(0, len(xy), timing.ROWS_AT_ONCE):
+        part = slice(start, start + timing.ROWS_AT_ONCE)
+        xy[part] = camera.undistort(given.distort(features.xy[part]))
+    return replace(features, xy=xy)
+
+
+def estimate_sensing(builder: MapBuilder, given: Camera, now: Sensing, sensor: SensorConfig, *, prior: dict[str, float]) -> Sensing | None:
+    """Find the unknowns at an adjusted map whose features were corrected by `now`.
+
+    given : the recording's calibration; prior : as `unknowns` gives it, standard deviations of the timing around 0, of the rest around `given`
+    Returns better numbers, with the same motion, those as before that do not differ significantly; None where the map is not determined.
     """
     part = adjustment.gather(builder, np.arange(len(builder.kf), dtype=np.int32), sensor)
-    if len(part.row) == 0:
+    if len(part.row) == 0 or not prior:
         return None
     T_kw, x_w = builder.T_kw(part.kfs), builder.lm.xyz[part.ids]
-    problem = bundle.Problem(T_kw, x_w, *part.arguments, camera, part.is_fixed)
-    px_per_s, depth_per_s, share = timing.flow(features, now.twist, camera, part.row)
-    columns = np.zeros((len(part.row), 3, 2))
-    columns[:, :2, 0] = -px_per_s * share[:, None]
-    columns[:, 2, 1] = -depth_per_s
-    found = estimate(problem, problem.T, problem.x, columns, prior=-np.array([now.readout, now.depth_delay]), prior_sigma=prior_sigma)
+    problem = bundle.Problem(T_kw, x_w, *part.arguments, now.camera, part.is_fixed)
+    names = list(prior)
+    predicted = problem.in_given_order(residuals(problem, problem.T, problem.x) + problem.measured[:, :3])
+    columns = np.stack([_column(name, builder.features, part.row, predicted, now, prior[name]) for name in names], axis=2)
+    value, centre = (
+        np.array([_number(name, camera, when) for name in names]) for camera, when in ((now.camera, now.timing), (given, None))
+    )
+    found = estimate(problem, problem.T, problem.x, columns, prior=centre - value, prior_sigma=np.array(list(prior.values())))
     if found is None:
         return None
-    better = Timing(readout=np.array(now.readout + found.value[0]), depth_delay=np.array(now.depth_delay + found.value[1]), twist=now.twist)
-    return better, found.sigma
+    value = value + found.value
+    # What cannot be told from what was believed stays so: the noise of its estimate would go into all measurements for nothing.
+    value = np.where(np.abs(value - centre) > SIGNIFICANT * found.sigma, value, centre)
+    better = dict(zip(names, value.tolist(), strict=True))
+    when = {name: np.array(better.pop(name)) for name in ("readout", "depth_delay") if name in better}
+    return Sensing(replace(now.camera, **better), replace(now.timing, **when), dict(zip(names, found.sigma.tolist(), strict=True)))
+
+
+def _number(name: str, camera: Camera, when: Timing | None) -> float:
+    """Look up an unknown; without timing, what is believed of it before looking."""
+    if hasattr(camera, name):
+        return float(getattr(camera, name))
+    return 0.0 if when is None else float(getattr(when, name))
+
+
+def _column(name: str, features: Features, rows: np.ndarray, predicted: np.ndarray, now: Sensing, sigma: float) -> np.ndarray:
+    """Give by how much the measurements `rows` (O,) grow per unit of an unknown, (O, 3) [px, px, m].
+
+    predicted : (O, 3) [px, px, m] where the map says they should be. Readings themselves would not do for what stretches them: it
+    stretches their errors too, and the least errors are those of the smallest camera.
+    """
+    column = np.zeros((len(rows), 3))
+    if name in ("readout", "depth_delay"):
+        px_per_s, depth_per_s, share = timing.flow(features, now.timing.twist, now.camera, rows)
+        if name == "readout":
+            column[:, :2] = -px_per_s * share[:, None]
+        else:
+            column[:, 2] = -depth_per_s
+        return column
+    # As the focal length changes, predictions move as well: what counts is where the ray points, in pixels of the camera of now.
+    raw, step = now.camera.distort(predicted[:, :2]), STEP * sigma
+    ahead, behind = (replace(now.camera, **{name: getattr(now.camera, name) + d}) for d in (step, -step))
+    focal = np.array([now.camera.fx, now.camera.fy])
+    column[:, :2] = (ahead.normalise(raw) - behind.normalise(raw)) * focal / (2.0 * step)
+    return column
 
 
 def estimate(

@@ -71,21 +71,20 @@ def flow(features: Features, twist: np.ndarray, camera: Camera, rows: np.ndarray
     return px_per_s, v[:, 2], xy[:, 1] / camera.height - 0.5
 
 
-def depth_lag(features: Features, rows: np.ndarray) -> np.ndarray:
-    """Give by how much the depth image's stamp is later than the colour image's, per row (N,) [s]; 0 where there is no depth."""
-    frame = np.searchsorted(features.offset, rows, side="right") - 1
-    return np.nan_to_num(features.depth_stamp[frame] - features.stamp[frame])
+def depth_lag(features: Features, timing: Timing) -> np.ndarray:
+    """Give by how much each frame's depth was taken later than its colour image, (F,) [s]; 0 where it is not to be moved."""
+    return np.nan_to_num(features.depth_stamp - features.stamp + float(timing.depth_delay))
 
 
 def rectify(features: Features, timing: Timing, camera: Camera) -> Features:
     """Give the features as a camera would have measured them that takes the whole image, and its depth, at the colour stamp."""
-    xy, depth = np.array(features.xy), np.array(features.depth)
+    xy, depth, lag = np.array(features.xy), np.array(features.depth), depth_lag(features, timing)
     for start in range(0, len(xy), ROWS_AT_ONCE):
         rows = np.arange(start, min(start + ROWS_AT_ONCE, len(xy)))
         px_per_s, depth_per_s, share = flow(features, timing.twist, camera, rows)
-        lag = depth_lag(features, rows) + float(timing.depth_delay)
+        frame = np.searchsorted(features.offset, rows, side="right") - 1
         xy[rows] -= px_per_s * (share * float(timing.readout))[:, None]
-        z = depth[rows] - depth_per_s * lag
+        z = depth[rows] - depth_per_s * lag[frame]
         depth[rows] = np.where(z > 0.0, z, np.nan)
     return replace(features, xy=xy, depth=depth)
 

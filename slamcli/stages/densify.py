@@ -22,7 +22,7 @@ GROUND_FRAMES = 40  # key frames, evenly spread, that are searched for the floor
 
 def run(inputs: Any, out: Path, cfg: Any, tools: Any) -> dict:
     """Find the floor, join the key frames' depth, write `cloud.ply` (and `mesh.ply` where a surface was made) in the floor's frame."""
-    camera, option = inputs.camera(), cfg.densify
+    camera, option = inputs.camera("loop"), cfg.densify
     poses = depth_poses(inputs)
     model_w = _model(camera, option)
     n_used = 0

@@ -42,7 +42,7 @@ def run(inputs, out: Path, cfg, tools) -> dict:
     features = _table(dataset, camera, found, cfg.extract.scale)
     artifacts.save(features, out)
     _write_association(out / "frames.txt", dataset, features.depth_stamp)
-    (out / "camera.json").write_text(json.dumps(camera.to_dict(), indent=2) + "\n")
+    write_camera(out, camera)
     n = np.diff(features.offset)
     return {
         "frames": len(dataset),
@@ -103,6 +103,11 @@ def depth_at(depth: np.ndarray, xy: np.ndarray, *, window: int = 1) -> np.ndarra
     readings = np.sort(depth[rows[:, :, None], columns[:, None, :]].reshape(len(xy), window * window), axis=1)  # NaN last
     n = np.isfinite(readings).sum(axis=1)
     return readings[np.arange(len(xy)), np.maximum(n - 1, 0) // 2]
+
+
+def write_camera(out: Path, camera: Camera) -> None:
+    """Write `camera.json`: the recording's calibration, and in later stages what is known of the camera by then."""
+    (out / "camera.json").write_text(json.dumps(camera.to_dict(), indent=2) + "\n")
 
 
 def _table(dataset: Dataset, camera: Camera, found: list[_Frame], scale: float) -> Features:

@@ -38,7 +38,7 @@ def run(inputs: Any, out: Path, cfg: Any, tools: Any) -> dict:
 
 
 def _from_depth(inputs: Any, T_lw: np.ndarray, cfg: Any, tools: Any) -> tuple[Grid, int]:
-    option, rays = cfg.grid2d, np.ascontiguousarray(inputs.camera().rays)
+    option, rays = cfg.grid2d, np.ascontiguousarray(inputs.camera("loop").rays)
     has_depth = np.isfinite(inputs.load(Features, "extract").depth_stamp)
     poses = [(frame, T_lw @ T_wd) for frame, T_wd in depth_poses(inputs, frames="all") if has_depth[frame]]
     chosen = grid.spaced(np.array([T_ld for _, T_ld in poses]).reshape(-1, 4, 4), metres=option.spacing, degrees=option.spacing_deg)

@@ -8,18 +8,20 @@ import numpy as np
 
 from slamcli import artifacts
 from slamcli.errors import SlamError
-from slamcli.mapping import adjustment, closure, hindsight, posegraph, segments, timing
+from slamcli.mapping import adjustment, closure, hindsight, posegraph, segments, selfcalibration
 from slamcli.mapping.closure import Candidate
 from slamcli.mapping.mapbuilder import MapBuilder
+from slamcli.mapping.selfcalibration import Sensing
 from slamcli.schema import LOST, Closures, Features, Map, Timing, Tracks, Words
+from slamcli.stages.extract import write_camera
 from slamcli.stages.track import save_map_stage, segment_file, segments_apart
 
 
 def run(inputs, out: Path, cfg, tools) -> dict:
     """Join map segments and close loops until no new one appears; then look at every frame again."""
-    words, tracks, camera = inputs.load(Words, "match"), inputs.load(Tracks, "optimize"), inputs.camera()
-    when = inputs.load(Timing, "optimize")
-    features = timing.rectify(inputs.load(Features, "extract"), when, camera)
+    words, tracks = inputs.load(Words, "match"), inputs.load(Tracks, "optimize")
+    when, camera = inputs.load(Timing, "optimize"), inputs.camera("optimize")
+    features = selfcalibration.correct(inputs.load(Features, "extract"), inputs.camera(), Sensing(camera, when, {}))
     builder = MapBuilder.from_map(features, inputs.load(Map, "optimize"))
     tried: list[Candidate] = []
     if cfg.loop.enabled and len(builder.kf) > 2:
@@ -35,6 +37,7 @@ def run(inputs, out: Path, cfg, tools) -> dict:
     save_map_stage(out, features.stamp, tracks, map_)
     artifacts.save(tracks, out)
     artifacts.save(when, out)
+    write_camera(out, camera)
     artifacts.save(closures_of(accepted), out)
     return {
         "frames": len(features.stamp),

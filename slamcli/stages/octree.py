@@ -28,7 +28,7 @@ def run(inputs: Any, out: Path, cfg: Any, tools: Any) -> dict:
     n_scans = 0
     for poses in rounds(inputs, grid, option):
         progress = tools.progress(poses, "octree")
-        for scan in scans(inputs.dataset, inputs.camera(), progress, cfg.sensor, option, workers=tools.workers, warn=tools.warn):
+        for scan in scans(inputs.dataset, inputs.camera("loop"), progress, cfg.sensor, option, workers=tools.workers, warn=tools.warn):
             grid.insert(scan.x, scan.origin, max_range=option.max_range, frame=scan.frame)
             n_scans += 1
     cells = grid.leaves()
@@ -59,7 +59,7 @@ def rounds(inputs: Any, grid: OccupancyMap, option: OctreeConfig) -> Iterator[li
     yield [pose for pose in poses if pose[0] in chosen]
     for _ in range(ROUNDS if option.frames == "auto" else 0):
         poses = [pose for pose in poses if pose[0] not in chosen]
-        asked = changes.witnesses(grid, poses, inputs.camera(), max_range=option.max_range)
+        asked = changes.witnesses(grid, poses, inputs.camera("loop"), max_range=option.max_range)
         chosen = {frame for frame, _ in asked}
         yield asked
 

@@ -1,4 +1,4 @@
-"""optimize: the whole map is adjusted at once, and the camera's timing with it; then every frame is refined against the map."""
+"""optimize: the whole map is adjusted at once, and with it what is not known of the camera; then every frame is refined against the map."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -6,55 +6,62 @@ from pathlib import Path
 import numpy as np
 
 from slamcli import artifacts
-from slamcli.geometry.camera import Camera
 from slamcli.mapping import adjustment, hindsight, selfcalibration, timing
 from slamcli.mapping.mapbuilder import MapBuilder
+from slamcli.mapping.selfcalibration import Sensing
 from slamcli.schema import Features, Map, Timing, Tracks
+from slamcli.stages.extract import write_camera
 from slamcli.stages.track import save_map_stage
 
 
 def run(inputs, out: Path, cfg, tools) -> dict:
-    """Refine key frames, landmarks, timing and frames, without closures."""
+    """Refine key frames, landmarks, what is not known of the camera, and frames, without closures."""
     features, tracks, map_ = inputs.load(Features, "extract"), inputs.load(Tracks, "track"), inputs.load(Map, "track")
-    camera = inputs.camera()
-    still = Timing(readout=np.array(0.0), depth_delay=np.array(0.0), twist=timing.frame_twists(features.stamp, tracks, map_))
-    when, sigma, summary = still, np.full(2, np.nan), {}
+    given = inputs.camera()
+    delay = np.array(0.0 if cfg.optimize.move_depth else np.nan)
+    still = Timing(readout=np.array(0.0), depth_delay=delay, twist=timing.frame_twists(features.stamp, tracks, map_))
+    sensing, summary = Sensing(given, still, {}), {}
     if cfg.optimize.enabled and len(map_.kf_frame) > 1:
         builder = MapBuilder.from_map(features, map_)
-        tracks, when, sigma, summary = refine(builder, features, tracks, still, camera, cfg, tools)
+        tracks, sensing, summary = refine(builder, features, tracks, sensing, cfg, tools)
         map_ = builder.snapshot()
     save_map_stage(out, features.stamp, tracks, map_)
     artifacts.save(tracks, out)
-    artifacts.save(when, out)
-    return {
-        "frames": len(features.stamp),
-        "key_frames": len(map_.kf_frame),
-        "readout_ms": [round(1e3 * float(when.readout), 3), round(1e3 * float(sigma[0]), 3)],
-        "depth_delay_ms": [round(1e3 * float(when.depth_delay), 3), round(1e3 * float(sigma[1]), 3)],
-    } | summary
+    artifacts.save(sensing.timing, out)
+    write_camera(out, sensing.camera)
+    return {"frames": len(features.stamp), "key_frames": len(map_.kf_frame)} | told(sensing) | summary
 
 
-def refine(
-    builder: MapBuilder, features: Features, tracks: Tracks, when: Timing, camera: Camera, cfg, tools
-) -> tuple[Tracks, Timing, np.ndarray, dict]:
-    """Adjust the map, find the timing that suits it, and again; returns tracks, timing, its standard deviations (2,) [s], the evidence.
+def refine(builder: MapBuilder, features: Features, tracks: Tracks, sensing: Sensing, cfg, tools) -> tuple[Tracks, Sensing, dict]:
+    """Adjust the map, find what of the camera suits it, and again; returns tracks, what was found, and the evidence.
 
-    The motion in `when` comes from poses, the poses from features that `when` rectified: two rounds bring both to rest.
+    sensing : what is known of the camera before. The motion in it comes from poses, the poses from features that it corrected: two
+    rounds bring both to rest.
     """
-    kfs, sigma, cost = np.arange(len(builder.kf), dtype=np.int32), np.full(2, np.nan), []
-    for _ in range(cfg.optimize.timing_rounds if cfg.optimize.timing else 0):
-        builder.features = timing.rectify(features, when, camera)
-        result = adjustment.adjust(builder, kfs, camera, cfg.sensor, max_iterations=cfg.optimize.iterations)
-        found = selfcalibration.estimate_timing(
-            builder, features, when, camera, cfg.sensor, prior_sigma=np.full(2, cfg.optimize.timing_prior)
-        )
+    kfs, given, cost = np.arange(len(builder.kf), dtype=np.int32), sensing.camera, []
+    prior = selfcalibration.unknowns(given, cfg.optimize)
+    for _ in range(cfg.optimize.rounds if prior else 0):
+        builder.features = selfcalibration.correct(features, given, sensing)
+        result = adjustment.adjust(builder, kfs, sensing.camera, cfg.sensor, max_iterations=cfg.optimize.iterations)
+        found = selfcalibration.estimate_sensing(builder, given, sensing, cfg.sensor, prior=prior)
         if result is None or found is None:
             break
-        when, sigma = found
-        when = replace(when, twist=timing.frame_twists(features.stamp, tracks, builder.snapshot()))
+        twist = timing.frame_twists(features.stamp, tracks, builder.snapshot())
+        sensing = replace(found, timing=replace(found.timing, twist=twist))
         cost.append(result.cost[-1])
-    builder.features = timing.rectify(features, when, camera)
-    result = adjustment.adjust(builder, kfs, camera, cfg.sensor, max_iterations=cfg.optimize.iterations)
-    tracks = hindsight.refine_frames(builder, builder.features, tracks, camera, cfg.sensor, cfg.track, tools.progress)
+    builder.features = selfcalibration.correct(features, given, sensing)
+    result = adjustment.adjust(builder, kfs, sensing.camera, cfg.sensor, max_iterations=cfg.optimize.iterations)
+    tracks = hindsight.refine_frames(builder, builder.features, tracks, sensing.camera, cfg.sensor, cfg.track, tools.progress)
     summary = {} if result is None else {"cost": [*cost, result.cost[-1]], "outliers": int((~result.is_inlier).sum())}
-    return tracks, when, sigma, summary
+    return tracks, sensing, summary
+
+
+def told(sensing: Sensing) -> dict:
+    """Tell the numbers found with their standard deviations."""
+    figures = {}
+    for name, sigma in sensing.sigma.items():
+        is_time = name in ("readout", "depth_delay")
+        unit = 1e3 if is_time else 1.0
+        value = getattr(sensing.timing if is_time else sensing.camera, name)
+        figures[f"{name}_ms" if is_time else name] = [round(unit * float(value), 3), round(unit * sigma, 3)]
+    return figures

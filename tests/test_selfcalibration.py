@@ -1,0 +1,120 @@
+"""What a recording says about its own camera: errors put into it are found, and what cannot be found is said to be unknown."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scene_run import Run
+from scenes import CAMERA, Scene, ape, observe, orbit, room_points
+
+from slamcli.config import OptimizeConfig, SensorConfig
+from slamcli.geometry.camera import Camera
+from slamcli.mapping import adjustment, selfcalibration, timing
+from slamcli.mapping.mapbuilder import MapBuilder
+from slamcli.mapping.selfcalibration import Sensing
+from slamcli.schema import Features, Timing, frame_poses
+from slamcli.stages import loop, optimize, track
+
+SENSOR = SensorConfig(depth_noise_base=0.0012, depth_noise_quadratic=0.0019, pixel_noise=0.5)  # the noise that `observe` makes
+
+
+def turn(turns: float, *, frames: int, per_frame: int = 400) -> Scene:
+    rng = np.random.default_rng(0)
+    return observe(orbit(frames, turns=turns), room_points(2500, rng), rng, per_frame=per_frame)
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return turn(0.06, frames=14, per_frame=600)
+
+
+def build(scene: Scene, features: Features) -> MapBuilder:
+    """Make every frame a key frame at its true pose, and every true landmark one of the map."""
+    builder, id_of = MapBuilder(features), np.full(len(scene.xyz), -1, np.int32)
+    for frame, T_gc in enumerate(scene.T_gc):
+        kf = builder.add_key_frame(frame, T_gc)
+        rows = np.arange(features.offset[frame], features.offset[frame + 1])
+        of = scene.landmark[rows]
+        is_known = id_of[of] >= 0
+        builder.observe(kf, id_of[of[is_known]], rows[is_known])
+        id_of[of[~is_known]] = builder.add_landmarks(kf, rows[~is_known], scene.xyz[of[~is_known]])
+    return builder
+
+
+def moving(scene: Scene, *, readout: float = 0.0, depth_delay: float = 0.0) -> Timing:
+    stamp = np.asarray(scene.features.stamp)
+    return Timing(readout=np.array(readout), depth_delay=np.array(depth_delay), twist=timing.twists(stamp, scene.T_gc))
+
+
+def look(scene: Scene, features: Features, given: Camera, option: OptimizeConfig, *, rounds: int = 3) -> Sensing:
+    """Adjust and estimate in turns, as optimize does."""
+    builder, sensing = build(scene, features), Sensing(given, moving(scene), {})
+    prior, kfs = selfcalibration.unknowns(given, option), np.arange(len(scene.T_gc), dtype=np.int32)
+    for _ in range(rounds):
+        builder.features = selfcalibration.correct(features, given, sensing)
+        adjustment.adjust(builder, kfs, sensing.camera, SENSOR, max_iterations=15)
+        sensing = selfcalibration.estimate_sensing(builder, given, sensing, SENSOR, prior=prior)
+    return sensing
+
+
+def test_timing_that_was_put_in_is_found_within_its_sigma(scene):
+    true = {"readout": 0.018, "depth_delay": -0.012}
+    shaken = timing.rectify(scene.features, moving(scene, **{name: -value for name, value in true.items()}), CAMERA)
+    found = look(scene, shaken, CAMERA, OptimizeConfig())
+    for name, value in true.items():
+        error = abs(float(getattr(found.timing, name)) - value)
+        assert 1e-6 < error < 4.0 * found.sigma[name] and found.sigma[name] < 0.003
+    assert set(found.sigma) == set(true) and found.camera == CAMERA
+
+
+def test_what_does_not_differ_from_what_was_believed_stays(scene):
+    found = look(scene, scene.features, CAMERA, OptimizeConfig(intrinsics=True))
+    assert found.camera == CAMERA and found.timing.readout == 0.0 == found.timing.depth_delay
+    assert all(sigma > 0.0 for sigma in found.sigma.values()) and len(found.sigma) == 6
+
+
+def test_intrinsics_that_were_put_in_are_found_within_their_sigma():
+    scene, given = turn(0.25, frames=40), replace(CAMERA, fx=523.0, fy=517.0, cx=321.5, cy=238.8)
+    found = look(scene, scene.features, given, OptimizeConfig(readout=False, depth_delay=False, intrinsics=True))
+    for name in ("fx", "fy", "cx", "cy"):
+        assert 1e-6 < abs(getattr(found.camera, name) - getattr(CAMERA, name)) < 4.0 * found.sigma[name]
+    # A camera that turns about its own upright axis learns nothing of the upright focal length.
+    assert found.sigma["fx"] < 1.0 and found.sigma["cx"] < 1.0 and found.sigma["fy"] > 0.9 * 0.02 * given.fy
+
+
+def test_the_map_is_made_with_the_camera_that_was_found(tmp_path):
+    """A guessed calibration bends the path; with it found, the path is as good as with the true one, and later stages know it."""
+    scene, guess = turn(0.5, frames=80, per_frame=300), replace(CAMERA, fx=508.0, fy=508.0, cx=325.0)
+    error = {}
+    for name, given, option in (
+        ("true", CAMERA, OptimizeConfig()),
+        ("guessed", guess, OptimizeConfig()),
+        ("found", guess, OptimizeConfig(intrinsics=True)),
+    ):
+        (tmp_path / name).mkdir()
+        run = Run(scene, tmp_path / name, given=given, optimize=option)
+        for stage in (track, optimize, loop):
+            run.stage(stage)
+        tracks, map_ = run.result("loop")
+        error[name] = ape(frame_poses(tracks, map_), scene.T_gc)
+        assert run.camera("loop") == run.camera("optimize")
+        assert (run.camera("loop") == given) == (name != "found")
+    assert 0.0 < error["found"] < 0.5 * error["guessed"] and error["found"] < 1.5 * error["true"]
+
+
+def test_features_under_another_calibration_keep_their_rays_and_return(scene):
+    lens = Camera(640, 480, 517.3, 516.5, 318.6, 255.3, k1=0.26, k2=-0.95, p1=-0.005, p2=0.0026, k3=1.16)
+    other = replace(lens, fx=520.0, cy=250.0, k1=0.25)
+    there = selfcalibration.recalibrate(scene.features, lens, other)
+    assert np.abs(there.xy - scene.features.xy).max() > 1.0
+    np.testing.assert_array_equal(there.depth, scene.features.depth)
+    raw = lens.distort(scene.features.xy[:500])
+    np.testing.assert_allclose(there.xy[:500], other.undistort(raw), atol=1e-3)
+    back = selfcalibration.recalibrate(there, other, lens)
+    np.testing.assert_allclose(back.xy, scene.features.xy, atol=5e-3)
+
+
+def test_depth_without_a_delay_to_go_by_stays_where_it_is(scene):
+    unmoved = timing.rectify(scene.features, moving(scene, depth_delay=np.nan), CAMERA)
+    np.testing.assert_array_equal(unmoved.depth, scene.features.depth)
+    assert "depth_delay" not in selfcalibration.unknowns(CAMERA, OptimizeConfig(move_depth=False))
