@@ -23,6 +23,7 @@ import numpy as np
 
 from slamcli import config_io
 from slamcli.config import Config
+from slamcli.datasets import open_dataset
 from slamcli.errors import SlamError
 from slamcli.rundir import RunDir
 
@@ -67,8 +68,8 @@ def measured(recording: str, offset: int, seed: int, levers: list[str], out: Pat
     features = accuracy.features_of(recording, offset, 1, [], out)
     folder = features.path.parent
     default = accuracy.variant(features, folder / "default", replace(Config(), seed=seed))
-    is_simulated = (default.dataset().root / "scene.json").is_file()
-    of = {"recording": Path(recording).name, "is_simulated": is_simulated, "offset": offset, "seed": seed}
+    source = open_dataset(recording)
+    of = {"recording": source.name, "is_simulated": (source.root / "scene.json").is_file(), "offset": offset, "seed": seed}
     pairs = []
     for lever in levers:
         turned = accuracy.variant(default, folder / "turned", config_io.apply(default.config(), [lever]))
