@@ -9,7 +9,8 @@ from slamcli.mapping import adjustment, pose, projection
 from slamcli.mapping.mapbuilder import MapBuilder
 from slamcli.mapping.pose import PoseEstimate
 from slamcli.mapping.projection import FrameFeatures
-from slamcli.schema import LOST, RELOCALISED, TRACKED, Features, Matches, Tracks, Words
+from slamcli.mapping.shape import Placement, Reliefs, Shape
+from slamcli.schema import LOST, ON_SHAPE, RELOCALISED, TRACKED, CoarseDepth, Features, Matches, Tracks, Words
 from slamcli.vision import hamming, vocabulary
 
 
@@ -61,8 +62,14 @@ class Localiser:
         settings: TrackConfig,
         sensor: SensorConfig,
         rng: np.random.Generator,
+        *,
+        depth: CoarseDepth | None = None,
+        map_depth: CoarseDepth | None = None,
     ):
-        """Take the map with the words of its features, and a recording's features, words and matches of neighbouring frames."""
+        """Take the map with the words of its features, and a recording's features, words and matches of neighbouring frames.
+
+        depth, map_depth : of that recording, and of the one that the map is of; without them, texture alone is followed
+        """
         self.builder, self.map_words = builder, map_words
         self.features, self.words, self.matches = features, words, matches
         self.camera, self.settings, self.sensor, self.rng = camera, settings, sensor, rng
@@ -76,6 +83,9 @@ class Localiser:
         self.state = np.full(n, LOST, dtype=np.uint8)
         self.n_inliers = np.zeros(n, dtype=np.int32)
         self.lost_reason: dict[int, str] = {}
+        self.shape = Shape(builder, *(Reliefs(given, camera, sensor) for given in (map_depth, depth)))
+        self._latest = -1  # frame that has a pose
+        self._placement: Placement | None = None  # of the latest frame, where it rests on shape
         self._pair_of = {(int(i), int(j)): p for p, (i, j) in enumerate(matches.pair)}
         self._previous: FrameFeatures | None = None
         self._lm_of_previous = np.empty(0, dtype=np.int32)  # landmark of each feature of the previous frame, -1 = none
@@ -99,28 +109,72 @@ class Localiser:
 
     def _locate(self, i: int, frame: FrameFeatures) -> np.ndarray:
         """Find the pose of frame `i`; returns the landmark of each of its features, none where it is lost."""
-        nothing = np.full(len(frame), -1, dtype=np.int32)
-        if len(frame) < self.settings.min_inliers:
-            self.lost_reason[i] = f"{len(frame)} features: blank or unreadable image"
-            return nothing
-        state = TRACKED
-        T_cw, ids = self._initial_pose(i, frame)
-        found = self._meet_local_map(frame, T_cw, ids, wanted=self.settings.min_inliers) if T_cw is not None else None
-        if found is None:
+        state, found = TRACKED, None
+        if len(frame) >= self.settings.min_inliers:
+            T_cw, ids = self._initial_pose(i, frame)
+            found = self._meet_local_map(frame, T_cw, ids, wanted=self.settings.min_inliers) if T_cw is not None else None
+        if found is None or found[0].n_inliers < self.settings.shape_below:
+            lm_of = self._locate_on_shape(i, frame, found)
+            if lm_of is not None:
+                return lm_of
+        if found is None and len(frame) >= self.settings.min_inliers:
             T_cw, ids = self._relocalise(i, frame)
             found = self._meet_local_map(frame, T_cw, ids, wanted=self.settings.relocalise_inliers) if T_cw is not None else None
             state = RELOCALISED
         if found is None:
-            self.lost_reason[i] = f"fewer than {self.settings.min_inliers} of {len(frame)} features agree with the map"
-            return nothing
+            self.lost_reason.setdefault(i, self._why_lost(frame))
+            return np.full(len(frame), -1, dtype=np.int32)
         estimate, lm_of = found
         self._record(i, estimate, lm_of, state)
         return lm_of
 
+    def _why_lost(self, frame: FrameFeatures) -> str:
+        if len(frame) < self.settings.min_inliers:
+            return f"{len(frame)} features: blank or unreadable image"
+        return f"fewer than {self.settings.min_inliers} of {len(frame)} features agree with the map"
+
     def _record(self, i: int, estimate: PoseEstimate, lm_of: np.ndarray, state: int) -> None:
         kf = int(np.argmax(self.builder.votes(lm_of[lm_of >= 0])))
-        self.ref_kf[i], self.state[i], self.n_inliers[i] = kf, state, estimate.n_inliers
-        self.T_kc[i] = se3.inverse(estimate.T_cw @ self.builder.kf.T_wk[kf])
+        self._hang(i, kf, estimate.T_cw, state, estimate.n_inliers)
+
+    def _hang(self, i: int, kf: int, T_cw: np.ndarray, state: int, n_inliers: int) -> None:
+        self.ref_kf[i], self.state[i], self.n_inliers[i], self._latest = kf, state, n_inliers, i
+        self.T_kc[i] = se3.inverse(T_cw @ self.builder.kf.T_wk[kf])
+
+    def _locate_on_shape(self, i: int, frame: FrameFeatures, found: tuple[PoseEstimate, np.ndarray] | None) -> np.ndarray | None:
+        """Align frame `i` with the key frame that the frame before it hangs on, together with what landmarks there are.
+
+        found : the pose that landmarks give, and the landmark of each feature, if they give one
+        Returns the landmark of each feature; None where depth shows another place, or not enough to determine the pose.
+        """
+        self._placement = None
+        if self._latest < 0:
+            return None
+        kf, T_wp = int(self.ref_kf[self._latest]), self.pose_of(self._latest)
+        if found is not None:
+            starts = [found[0].T_cw]
+        else:
+            starts = [self._predict(i, T_wp), se3.inverse(T_wp)] if self._latest == i - 1 else [se3.inverse(T_wp)]
+        placed = self.shape.place(i, kf, starts)
+        if placed is None or not placed.is_sound:
+            return None
+        if placed.n_determined < 6:
+            found = found or self._meet_few(frame, placed.T_cw, kf)
+            if found is not None:
+                placed = self.shape.place(i, kf, [placed.T_cw], known=(found[0].T_cw, found[0].information))
+        if placed.n_determined < 6 or not placed.is_sound:
+            self.lost_reason[i] = f"the depth shows {placed.n_determined} of 6 directions only: a flat wall"
+            return None
+        found = self._meet_few(frame, placed.T_cw, kf)
+        lm_of = np.full(len(frame), -1, dtype=np.int32) if found is None else found[1]
+        self._hang(i, kf, placed.T_cw, ON_SHAPE, int((lm_of >= 0).sum()))
+        self._placement = placed
+        return lm_of
+
+    def _meet_few(self, frame: FrameFeatures, T_cw: np.ndarray, kf: int) -> tuple[PoseEstimate, np.ndarray] | None:
+        """Search the frame for the landmarks around key frame `kf`; None where fewer than a pose needs are there."""
+        around = self.builder.landmarks_in(np.append(self.builder.joined_by_edges(np.array([kf])), kf))
+        return self._meet_local_map(frame, T_cw, around, wanted=4) if len(around) and len(frame) else None
 
     def _initial_pose(self, i: int, frame: FrameFeatures) -> tuple[np.ndarray | None, np.ndarray]:
         """Guess from the features matched to the previous frame, by P3P in RANSAC; else from the motion before it.

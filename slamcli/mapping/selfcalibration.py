@@ -39,7 +39,7 @@ def estimate_timing(
     if len(part.row) == 0:
         return None
     T_kw, x_w = builder.T_kw(part.kfs), builder.lm.xyz[part.ids]
-    problem = bundle.Problem(T_kw, x_w, *part.arguments, camera, part.is_fixed)
+    problem = bundle.Problem(T_kw, x_w, *part.arguments, camera, part.is_fixed, part.edges)
     px_per_s, depth_per_s, share = timing.flow(features, now.twist, camera, part.row)
     columns = np.zeros((len(part.row), 3, 2))
     columns[:, :2, 0] = -px_per_s * share[:, None]
