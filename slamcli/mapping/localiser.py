@@ -13,6 +13,9 @@ from slamcli.mapping.shape import Placement, Reliefs, Shape
 from slamcli.schema import LOST, ON_SHAPE, RELOCALISED, TRACKED, CoarseDepth, Features, Matches, Tracks, Words
 from slamcli.vision import hamming, vocabulary
 
+# [1/m^2, 1/rad^2] what is known of the motion from one frame to the next when it goes on as before: within 10 mm and 0.6 degrees.
+STEADY = 1e4 * np.eye(6)
+
 
 def frame_features(features: Features, frame: int, camera: Camera, sensor: SensorConfig) -> FrameFeatures:
     """Gather the features of one frame with their noise."""
@@ -84,7 +87,7 @@ class Localiser:
         self.n_inliers = np.zeros(n, dtype=np.int32)
         self.lost_reason: dict[int, str] = {}
         self.shape = Shape(builder, *(Reliefs(given, camera, sensor) for given in (map_depth, depth)))
-        self._latest = -1  # frame that has a pose
+        self._latest = self._surely = -1  # frame that has a pose, and frame all of whose pose was measured
         self._placement: Placement | None = None  # of the latest frame, where it rests on shape
         self._pair_of = {(int(i), int(j)): p for p, (i, j) in enumerate(matches.pair)}
         self._previous: FrameFeatures | None = None
@@ -138,7 +141,7 @@ class Localiser:
         self._hang(i, kf, estimate.T_cw, state, estimate.n_inliers)
 
     def _hang(self, i: int, kf: int, T_cw: np.ndarray, state: int, n_inliers: int) -> None:
-        self.ref_kf[i], self.state[i], self.n_inliers[i], self._latest = kf, state, n_inliers, i
+        self.ref_kf[i], self.state[i], self.n_inliers[i], self._latest, self._surely = kf, state, n_inliers, i, i
         self.T_kc[i] = se3.inverse(T_cw @ self.builder.kf.T_wk[kf])
 
     def _locate_on_shape(self, i: int, frame: FrameFeatures, found: tuple[PoseEstimate, np.ndarray] | None) -> np.ndarray | None:
@@ -151,24 +154,27 @@ class Localiser:
         if self._latest < 0:
             return None
         kf, T_wp = int(self.ref_kf[self._latest]), self.pose_of(self._latest)
-        if found is not None:
-            starts = [found[0].T_cw]
-        else:
-            starts = [self._predict(i, T_wp), se3.inverse(T_wp)] if self._latest == i - 1 else [se3.inverse(T_wp)]
-        placed = self.shape.place(i, kf, starts)
+        expected = self._predict(i, T_wp, self._latest)
+        placed = self.shape.place(i, kf, [expected, se3.inverse(T_wp)] if found is None else [found[0].T_cw])
         if placed is None or not placed.is_sound:
             return None
         if placed.n_determined < 6:
-            found = found or self._meet_few(frame, placed.T_cw, kf)
-            if found is not None:
-                placed = self.shape.place(i, kf, [placed.T_cw], known=(found[0].T_cw, found[0].information))
-        if placed.n_determined < 6 or not placed.is_sound:
+            few = found or self._meet_few(frame, placed.T_cw, kf)
+            if few is not None:
+                placed = self.shape.place(i, kf, [placed.T_cw], known=(few[0].T_cw, few[0].information))
+        surely = self._surely if placed.n_determined < 6 else i
+        if surely < i:
             self.lost_reason[i] = f"the depth shows {placed.n_determined} of 6 directions only: a flat wall"
+            if found is not None or self.features.stamp[i] - self.features.stamp[surely] > self.settings.shape_hold:
+                return None
+            placed = self.shape.place(i, kf, [expected], known=(expected, STEADY))
+        if not placed.is_sound:
             return None
-        found = self._meet_few(frame, placed.T_cw, kf)
-        lm_of = np.full(len(frame), -1, dtype=np.int32) if found is None else found[1]
+        few = self._meet_few(frame, placed.T_cw, kf)
+        lm_of = np.full(len(frame), -1, dtype=np.int32) if few is None else few[1]
         self._hang(i, kf, placed.T_cw, ON_SHAPE, int((lm_of >= 0).sum()))
-        self._placement = placed
+        self._surely, self._placement = surely, placed
+        self.lost_reason.pop(i, None)
         return lm_of
 
     def _meet_few(self, frame: FrameFeatures, T_cw: np.ndarray, kf: int) -> tuple[PoseEstimate, np.ndarray] | None:
@@ -185,7 +191,7 @@ class Localiser:
         if T_wp is None:
             return None, np.empty(0, np.int32)
         rows, x_w, ids = self._inherit(i, T_wp)
-        guesses = [self._predict(i, T_wp)]
+        guesses = [self._predict(i, T_wp, i - 1)]
         if len(rows) >= self.settings.min_inliers:
             start = pose.ransac_p3p(
                 x_w,
@@ -222,13 +228,13 @@ class Localiser:
         is_usable = np.isfinite(x_w[:, 0])
         return match[is_usable, 0], x_w[is_usable], ids[is_usable]
 
-    def _predict(self, i: int, T_wp: np.ndarray) -> np.ndarray:
-        """Give T_cw of frame `i` under the motion between the two frames before it, scaled by the time between."""
-        T_wq = self.pose_of(i - 2) if i >= 2 else None
-        if T_wq is None or self.segment_of(i - 2) != self.segment_of(i - 1):
+    def _predict(self, i: int, T_wp: np.ndarray, p: int) -> np.ndarray:
+        """Give T_cw of frame `i` under the motion between frame `p`, whose pose is T_wp, and the one before that, scaled by the time."""
+        T_wq = self.pose_of(p - 1) if p >= 1 else None
+        if T_wq is None or self.segment_of(p - 1) != self.segment_of(p):
             return se3.inverse(T_wp)
         stamp = self.features.stamp
-        share = (stamp[i] - stamp[i - 2]) / (stamp[i - 1] - stamp[i - 2])
+        share = (stamp[i] - stamp[p - 1]) / (stamp[p] - stamp[p - 1])
         # A gap in the recording says nothing about the motion within it.
         return se3.inverse(se3.interpolate(T_wq, T_wp, share if share < 4.0 else 1.0))
 

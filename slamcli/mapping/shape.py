@@ -41,7 +41,7 @@ class Reliefs:
         return found
 
     def _make(self, frame: int) -> Relief | None:
-        if frame >= len(self._depth) or not self._depth[frame].any():
+        if not 0 <= frame < len(self._depth) or not self._depth[frame].any():
             return None
         relief = surface.relief(self._depth[frame], self._camera, self._sensor)
         return relief if len(relief) >= LEAST_POINTS * relief.row.size else None
@@ -96,11 +96,12 @@ class Shape:
 
     def fixes_all(self, frame: int) -> bool:
         """Say whether the shape that a frame shows determines all directions of motion, so that a map can begin with it."""
-        relief = self._reliefs.of(frame)
-        if relief is None:
+        # Not by itself: the errors of its normals would agree, and a wall would seem rough.
+        here, there = self._reliefs.of(frame), self._reliefs.of(frame + 1) or self._reliefs.of(frame - 1)
+        if here is None or there is None:
             return False
-        itself = surface.align(np.eye(4), relief, relief)
-        return surface.n_determined(itself.information, itself.depth) == 6
+        found = surface.align(np.eye(4), here, there)
+        return found.agreement >= MIN_AGREEMENT and surface.n_determined(found.information, found.depth) == 6
 
     def join(self, kf: int) -> int:
         """Add edges between a key frame and the earlier ones around that show the same; returns how many."""

@@ -100,6 +100,8 @@ class Tracker(Localiser):
 
     def _leaves_shape(self, i: int) -> bool:
         """Say whether frame `i` shows too little of the key frame that it was aligned with, or sees it from elsewhere."""
+        if self._surely < i:
+            return False  # what rests on it would share its error
         motion = se3.log(self.T_kc[i])
         is_far = np.linalg.norm(motion[:3]) > SHAPE_M or np.linalg.norm(motion[3:]) > SHAPE_RAD
         return bool(is_far or self._placement.alignment.overlap < self.settings.key_frame_share)
@@ -123,7 +125,7 @@ class Tracker(Localiser):
         self.places.add(kf, *word_vector(self.words, i))
         if self.state[i] == ON_SHAPE:
             self.shape.join(kf)
-        self.ref_kf[i], self.T_kc[i], self.state[i], self._latest = kf, np.eye(4), KEY_FRAME, i
+        self.ref_kf[i], self.T_kc[i], self.state[i], self._latest, self._surely = kf, np.eye(4), KEY_FRAME, i, i
         self._cull(kf)
         self._recent = np.concatenate([self._recent, added])
         self._share_with_neighbours(kf, added)
