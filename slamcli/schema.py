@@ -12,9 +12,16 @@ import numpy as np
 FORMAT = 3  # of everything a run directory holds; raised whenever an array changes its meaning
 
 
-def array(dtype: str, shape: str, meaning: str) -> Any:
-    """Declare a field: numpy dtype, symbolic shape such as "M 2" or "F+1" ("" for a scalar), meaning with unit."""
-    return field(metadata={"dtype": np.dtype(dtype), "shape": tuple(shape.split()), "meaning": meaning})
+def array(dtype: str, shape: str, meaning: str, *, may_lack: bool = False) -> Any:
+    """Declare a field: numpy dtype, symbolic shape such as "M 2" or "F+1" ("" for a scalar), meaning with unit.
+
+    may_lack : where the field is not given, it has no rows
+    """
+    symbols = tuple(shape.split())
+    metadata = {"dtype": np.dtype(dtype), "shape": symbols, "meaning": meaning}
+    if may_lack:
+        return field(default_factory=lambda: np.zeros([int(s) if s.isdigit() else 0 for s in symbols], dtype), metadata=metadata)
+    return field(metadata=metadata)
 
 
 @dataclass(frozen=True)
@@ -91,9 +98,9 @@ class Map:
     obs_lm: np.ndarray = array("i4", "O", "sorted by (landmark, key frame), pairs unique")
     obs_kf: np.ndarray = array("i4", "O", "row in kf_frame")
     obs_row: np.ndarray = array("i8", "O", "row in Features")
-    edge_kf: np.ndarray = array("i4", "E 2", "key frames (i, j), j < i, whose depth images were aligned")
-    edge_T_ij: np.ndarray = array("f8", "E 4 4", "x_i = T_ij @ x_j, as aligned")
-    edge_information: np.ndarray = array("f8", "E 6 6", "1/m^2, 1/rad^2, of the left twist of T_ij")
+    edge_kf: np.ndarray = array("i4", "E 2", "key frames (i, j), j < i, whose depth images were aligned", may_lack=True)
+    edge_T_ij: np.ndarray = array("f8", "E 4 4", "x_i = T_ij @ x_j, as aligned", may_lack=True)
+    edge_information: np.ndarray = array("f8", "E 6 6", "1/m^2, 1/rad^2, of the left twist of T_ij", may_lack=True)
 
 
 @dataclass(frozen=True)

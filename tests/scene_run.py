@@ -7,7 +7,7 @@ from scenes import CAMERA
 
 from slamcli import artifacts
 from slamcli.config import LoopConfig, OptimizeConfig, SensorConfig, TrackConfig
-from slamcli.schema import Features, Map, Matches, Tracks, Words
+from slamcli.schema import CoarseDepth, Features, Map, Matches, Tracks, Words
 
 SENSOR = SensorConfig(pixel_noise=0.5)
 
@@ -18,10 +18,11 @@ class Run:
     def __init__(self, scene, folder, **loop_settings):
         self.scene, self.folder, self.warnings = scene, folder, []
         self.cfg = SimpleNamespace(track=TrackConfig(), sensor=SENSOR, optimize=OptimizeConfig(), loop=LoopConfig(**loop_settings))
+        self.depth = CoarseDepth(np.zeros((len(scene.features.stamp), 0, 0), np.uint16))
         self.warn, self.summary = self.warnings.append, {}
 
     def load(self, cls, stage):
-        given = {Features: self.scene.features, Words: self.scene.words, Matches: self.scene.matches}
+        given = {Features: self.scene.features, Words: self.scene.words, Matches: self.scene.matches, CoarseDepth: self.depth}
         return given[cls] if cls in given else artifacts.load(cls, self.folder / stage)
 
     def camera(self):

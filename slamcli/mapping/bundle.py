@@ -10,7 +10,7 @@ import numpy as np
 from slamcli.geometry import se3
 from slamcli.geometry.camera import Camera
 from slamcli.mapping import bundle_kernels as kernels
-from slamcli.mapping.bundle_edges import NO_EDGES, EdgeTerms, Edges
+from slamcli.mapping.bundle_edges import NO_EDGES, Edges, EdgeTerms
 from slamcli.mapping.pose import CHI2_95_2DOF, CHI2_95_3DOF
 from slamcli.mapping.reduced_system import Factor, order_and_blocks
 

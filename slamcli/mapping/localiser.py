@@ -9,10 +9,12 @@ from slamcli.mapping import adjustment, pose, projection
 from slamcli.mapping.mapbuilder import MapBuilder
 from slamcli.mapping.pose import PoseEstimate
 from slamcli.mapping.projection import FrameFeatures
-from slamcli.mapping.shape import Placement, Reliefs, Shape
-from slamcli.schema import LOST, ON_SHAPE, RELOCALISED, TRACKED, CoarseDepth, Features, Matches, Tracks, Words
+from slamcli.mapping.shape import NoReliefs, Placement, Reliefs, Shape
+from slamcli.schema import LOST, ON_SHAPE, RELOCALISED, TRACKED, Features, Matches, Tracks, Words
 from slamcli.vision import hamming, vocabulary
 
+NO_RELIEFS = NoReliefs()
+SEARCH_FRAMES = 30.0  # after so many without a pose, where the motion before would have led is no place to begin a search
 # [1/m^2, 1/rad^2] what is known of the motion from one frame to the next when it goes on as before: within 10 mm and 0.6 degrees.
 STEADY = 1e4 * np.eye(6)
 
@@ -66,12 +68,12 @@ class Localiser:
         sensor: SensorConfig,
         rng: np.random.Generator,
         *,
-        depth: CoarseDepth | None = None,
-        map_depth: CoarseDepth | None = None,
+        reliefs: Reliefs = NO_RELIEFS,
+        map_reliefs: Reliefs = NO_RELIEFS,
     ):
         """Take the map with the words of its features, and a recording's features, words and matches of neighbouring frames.
 
-        depth, map_depth : of that recording, and of the one that the map is of; without them, texture alone is followed
+        reliefs, map_reliefs : of that recording, and of the one that the map is of; without them, texture alone is followed
         """
         self.builder, self.map_words = builder, map_words
         self.features, self.words, self.matches = features, words, matches
@@ -86,7 +88,7 @@ class Localiser:
         self.state = np.full(n, LOST, dtype=np.uint8)
         self.n_inliers = np.zeros(n, dtype=np.int32)
         self.lost_reason: dict[int, str] = {}
-        self.shape = Shape(builder, *(Reliefs(given, camera, sensor) for given in (map_depth, depth)))
+        self.shape = Shape(builder, map_reliefs, reliefs)
         self._latest = self._surely = -1  # frame that has a pose, and frame all of whose pose was measured
         self._placement: Placement | None = None  # of the latest frame, where it rests on shape
         self._pair_of = {(int(i), int(j)): p for p, (i, j) in enumerate(matches.pair)}
@@ -154,7 +156,7 @@ class Localiser:
         if self._latest < 0:
             return None
         kf, T_wp = int(self.ref_kf[self._latest]), self.pose_of(self._latest)
-        expected = self._predict(i, T_wp, self._latest)
+        expected = self._predict(i, T_wp, self._latest, reach=SEARCH_FRAMES)
         placed = self.shape.place(i, kf, [expected, se3.inverse(T_wp)] if found is None else [found[0].T_cw])
         if placed is None or not placed.is_sound:
             return None
@@ -228,15 +230,18 @@ class Localiser:
         is_usable = np.isfinite(x_w[:, 0])
         return match[is_usable, 0], x_w[is_usable], ids[is_usable]
 
-    def _predict(self, i: int, T_wp: np.ndarray, p: int) -> np.ndarray:
-        """Give T_cw of frame `i` under the motion between frame `p`, whose pose is T_wp, and the one before that, scaled by the time."""
+    def _predict(self, i: int, T_wp: np.ndarray, p: int, *, reach: float = 4.0) -> np.ndarray:
+        """Give T_cw of frame `i` under the motion between frame `p`, whose pose is T_wp, and the one before that, scaled by the time.
+
+        reach : times the time between those two, beyond which T_wp itself is given
+        """
         T_wq = self.pose_of(p - 1) if p >= 1 else None
         if T_wq is None or self.segment_of(p - 1) != self.segment_of(p):
             return se3.inverse(T_wp)
         stamp = self.features.stamp
         share = (stamp[i] - stamp[p - 1]) / (stamp[p] - stamp[p - 1])
         # A gap in the recording says nothing about the motion within it.
-        return se3.inverse(se3.interpolate(T_wq, T_wp, share if share < 4.0 else 1.0))
+        return se3.inverse(se3.interpolate(T_wq, T_wp, share if share < reach else 1.0))
 
     def _relocalise(self, i: int, frame: FrameFeatures) -> tuple[np.ndarray | None, np.ndarray]:
         """Recognise a key frame by its words and find the pose in it; [Z] (10)."""

@@ -25,9 +25,8 @@ JOIN_MOST = 5  # edges of a new key frame to earlier ones: more of them hold dow
 class Reliefs:
     """The reliefs of a recording's frames; those used last are kept."""
 
-    def __init__(self, depth: CoarseDepth | None, camera: Camera, sensor: SensorConfig) -> None:
-        self._depth = np.zeros((0, 0, 0), dtype=np.uint16) if depth is None else depth.coarse_depth
-        self._camera, self._sensor = camera, sensor
+    def __init__(self, depth: CoarseDepth, camera: Camera, sensor: SensorConfig) -> None:
+        self._depth, self._camera, self._sensor = depth.coarse_depth, camera, sensor
         self._kept: OrderedDict[int, Relief | None] = OrderedDict()
 
     def of(self, frame: int) -> Relief | None:
@@ -45,6 +44,16 @@ class Reliefs:
             return None
         relief = surface.relief(self._depth[frame], self._camera, self._sensor)
         return relief if len(relief) >= LEAST_POINTS * relief.row.size else None
+
+
+class NoReliefs(Reliefs):
+    """Of a recording whose depth images are not looked at."""
+
+    def __init__(self) -> None:
+        """Take nothing."""
+
+    def of(self, frame: int) -> None:
+        """Give no relief."""
 
 
 @dataclass(frozen=True)
@@ -69,9 +78,7 @@ class Shape:
         """Take the map with the reliefs of the recording it is of, and those of the recording whose frames are placed."""
         self._builder, self._map_reliefs, self._reliefs = builder, map_reliefs, reliefs
 
-    def place(
-        self, frame: int, kf: int, starts: list[np.ndarray], known: tuple[np.ndarray, np.ndarray] | None = None
-    ) -> Placement | None:
+    def place(self, frame: int, kf: int, starts: list[np.ndarray], known: tuple[np.ndarray, np.ndarray] | None = None) -> Placement | None:
         """Align a frame with key frame `kf` from the first of the poses `starts` (T_cw) that leads to a sound placement.
 
         known : a pose T_cw (4, 4) and the information (6, 6) of its left twist, as landmarks give. None where depth is missing.
@@ -85,9 +92,7 @@ class Shape:
         for T_cw in starts:
             found = surface.align(T_cw @ T_wk, source, target, known=besides)
             information = found.information + (0.0 if known is None else known[1])
-            candidate = Placement(
-                found.T_ij @ se3.inverse(T_wk), kf, found, surface.n_determined(information, found.depth)
-            )
+            candidate = Placement(found.T_ij @ se3.inverse(T_wk), kf, found, surface.n_determined(information, found.depth))
             if placement is None or candidate.alignment.agreement > placement.alignment.agreement:
                 placement = candidate
             if placement.is_sound:

@@ -6,10 +6,11 @@ from slamcli.config import SensorConfig, TrackConfig
 from slamcli.geometry import se3
 from slamcli.geometry.camera import Camera
 from slamcli.mapping import adjustment, projection
-from slamcli.mapping.localiser import Localiser, frame_features, word_vector
+from slamcli.mapping.localiser import NO_RELIEFS, Localiser, frame_features, word_vector
 from slamcli.mapping.mapbuilder import MapBuilder
 from slamcli.mapping.projection import FrameFeatures
-from slamcli.schema import KEY_FRAME, LOST, ON_SHAPE, CoarseDepth, Features, Map, Matches, Words
+from slamcli.mapping.shape import Reliefs
+from slamcli.schema import KEY_FRAME, LOST, ON_SHAPE, Features, Map, Matches, Words
 
 SHAPE_M, SHAPE_RAD = 0.3, 0.26  # a frame on shape that has moved or turned so far from its key frame becomes one
 CROWD_M, CROWD_COSINE = 0.1, 0.9945  # key frames nearer than this, and turned by less than 6 degrees, stand in the same place
@@ -32,10 +33,11 @@ class Tracker(Localiser):
         sensor: SensorConfig,
         rng: np.random.Generator,
         *,
-        depth: CoarseDepth | None = None,
+        reliefs: Reliefs = NO_RELIEFS,
     ):
+        builder = MapBuilder(features)
         super().__init__(
-            MapBuilder(features), words, features, words, matches, camera, settings, sensor, rng, depth=depth, map_depth=depth
+            builder, words, features, words, matches, camera, settings, sensor, rng, reliefs=reliefs, map_reliefs=reliefs
         )  # fmt: skip
         self.segment = -1  # that frames are added to; -1 before the first
         self._n_lost = 0  # frames in a row that saw enough and were not recognised

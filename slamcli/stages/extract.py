@@ -37,10 +37,12 @@ def run(inputs, out: Path, cfg, tools) -> dict:
         for fault in frame.faults:
             tools.warn(f"frame {i} skipped: {fault}" if len(frame.points) == 0 else f"frame {i} has no depth: {fault}")
     if not any(len(frame.points) for frame in found):
-        blank = f"no feature in any of the {len(dataset)} colour frames: are they blank? try: slamcli inspect {dataset.root}"
+        blank = (
+            f"{dataset.root}: no feature in any of the {len(dataset)} colour frames: are they blank? try: slamcli inspect {dataset.root}"
+        )
         if not any(frame.coarse is not None and frame.coarse.any() for frame in found):
-            raise SlamError(f"{dataset.root}: {blank}")
-        tools.warn(f"{blank}; only shape can be tracked")
+            raise SlamError(blank)
+        tools.warn(f"{blank}; the camera can be tracked by the shape alone that depth shows")
     features = _table(dataset, camera, found, cfg.extract.scale)
     artifacts.save(features, out)
     artifacts.save(_coarse_table(camera, found), out)
@@ -51,7 +53,7 @@ def run(inputs, out: Path, cfg, tools) -> dict:
         "frames": len(dataset),
         "features": int(n.sum()),
         "features_per_frame": [int(n.min()), float(np.median(n)), int(n.max())],
-        "with_depth": float(np.isfinite(features.depth).mean()),
+        "with_depth": float(np.isfinite(features.depth).mean()) if len(features.depth) else 0.0,
         "frames_without_depth": int(np.isnan(features.depth_stamp).sum()),
         "bad_images": sum(len(frame.faults) for frame in found),
     }

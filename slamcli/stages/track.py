@@ -8,8 +8,22 @@ import numpy as np
 from slamcli import artifacts
 from slamcli.formats import trajectory as trajectory_file
 from slamcli.mapping import segments
+from slamcli.mapping.shape import Reliefs
 from slamcli.mapping.tracker import Tracker
-from slamcli.schema import LOST, ON_SHAPE, RELOCALISED, CoarseDepth, Features, Map, Matches, Tracks, Trajectory, Words, frame_segments, trajectory
+from slamcli.schema import (
+    LOST,
+    ON_SHAPE,
+    RELOCALISED,
+    CoarseDepth,
+    Features,
+    Map,
+    Matches,
+    Tracks,
+    Trajectory,
+    Words,
+    frame_segments,
+    trajectory,
+)
 
 
 def run(inputs, out: Path, cfg, tools) -> dict:
@@ -17,7 +31,7 @@ def run(inputs, out: Path, cfg, tools) -> dict:
     features = inputs.load(Features, "extract")
     tracker = Tracker(
         features, inputs.load(Words, "match"), inputs.load(Matches, "match"), inputs.camera(), cfg.track, cfg.sensor, tools.rng(),
-        depth=inputs.load(CoarseDepth, "extract"),
+        reliefs=Reliefs(inputs.load(CoarseDepth, "extract"), inputs.camera(), cfg.sensor),
     )  # fmt: skip
     for i in tools.progress(range(len(features.stamp)), "track"):
         tracker.process(i)
