@@ -108,7 +108,7 @@ class TrackConfig:
     key_frame_gap: int = option(8, "frames between key frames at most", ge=1)
     key_frame_crowd: int = option(12, "unless so many stand within 0.1 m and 6 degrees of the frame already", ge=1)
     shape_below: int = option(
-        200, "a pose that rests on fewer landmarks is found by aligning the shapes that depth shows; 0 = only where features fail", ge=0
+        150, "a pose that rests on fewer landmarks is found by aligning the shapes that depth shows; 0 = only where features fail", ge=0
     )
     shape_hold: float = option(
         1.0, "where shape leaves a direction open, as along a flat wall, it is taken from the motion before it for so long [s]", ge=0, le=10

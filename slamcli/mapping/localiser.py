@@ -1,5 +1,8 @@
 """Find the poses of frames, one after the other, in a map that is already there."""
 
+from collections.abc import Iterator
+from functools import partial
+
 import numpy as np
 
 from slamcli.config import SensorConfig, TrackConfig
@@ -14,7 +17,9 @@ from slamcli.schema import LOST, ON_SHAPE, RELOCALISED, TRACKED, Features, Match
 from slamcli.vision import hamming, vocabulary
 
 NO_RELIEFS = NoReliefs()
-SEARCH_FRAMES = 30.0  # after so many without a pose, where the motion before would have led is no place to begin a search
+SEARCH_KEY_FRAMES = 3  # around, that a frame is aligned with when the key frame before it does not do
+FEW = 10  # landmarks that help shape; fewer are found anywhere
+SEARCH_SECONDS = 2.0  # after so long without a pose, what looks like the shape around the last one may be any placeSEARCH_KEY_FRAMES = 2  # around, that such a frame is aligned with when the key frame before does not do
 # [1/m^2, 1/rad^2] what is known of the motion from one frame to the next when it goes on as before: within 10 mm and 0.6 degrees.
 STEADY = 1e4 * np.eye(6)
 
@@ -144,6 +149,7 @@ class Localiser:
 
     def _hang(self, i: int, kf: int, T_cw: np.ndarray, state: int, n_inliers: int) -> None:
         self.ref_kf[i], self.state[i], self.n_inliers[i], self._latest, self._surely = kf, state, n_inliers, i, i
+        self.lost_reason.pop(i, None)
         self.T_kc[i] = se3.inverse(T_cw @ self.builder.kf.T_wk[kf])
 
     def _locate_on_shape(self, i: int, frame: FrameFeatures, found: tuple[PoseEstimate, np.ndarray] | None) -> np.ndarray | None:
@@ -153,36 +159,44 @@ class Localiser:
         Returns the landmark of each feature; None where depth shows another place, or not enough to determine the pose.
         """
         self._placement = None
-        if self._latest < 0:
+        if self._latest < 0 or self.features.stamp[i] - self.features.stamp[self._latest] > SEARCH_SECONDS:
             return None
-        kf, T_wp = int(self.ref_kf[self._latest]), self.pose_of(self._latest)
-        expected = self._predict(i, T_wp, self._latest, reach=SEARCH_FRAMES)
-        placed = self.shape.place(i, kf, [expected, se3.inverse(T_wp)] if found is None else [found[0].T_cw])
+        T_wp = self.pose_of(self._latest)
+        expected = self._predict(i, T_wp, self._latest, reach=np.inf)
+        if found is None:
+            placed = self.shape.find(i, self._references(i, expected), [expected, se3.inverse(T_wp)], partial(self._meet_few, frame))
+        else:
+            placed = self.shape.place(i, int(self.ref_kf[self._latest]), [found[0].T_cw], (found[0].T_cw, found[0].information))
         if placed is None or not placed.is_sound:
             return None
-        if placed.n_determined < 6:
-            few = found or self._meet_few(frame, placed.T_cw, kf)
-            if few is not None:
-                placed = self.shape.place(i, kf, [placed.T_cw], known=(few[0].T_cw, few[0].information))
         surely = self._surely if placed.n_determined < 6 else i
         if surely < i:
             self.lost_reason[i] = f"the depth shows {placed.n_determined} of 6 directions only: a flat wall"
             if found is not None or self.features.stamp[i] - self.features.stamp[surely] > self.settings.shape_hold:
                 return None
-            placed = self.shape.place(i, kf, [expected], known=(expected, STEADY))
-        if not placed.is_sound:
-            return None
-        few = self._meet_few(frame, placed.T_cw, kf)
+            placed = self.shape.place(i, placed.kf, [expected], (expected, STEADY))
+            if not placed.is_sound:
+                return None
+        few = self._meet_few(frame, placed)
         lm_of = np.full(len(frame), -1, dtype=np.int32) if few is None else few[1]
-        self._hang(i, kf, placed.T_cw, ON_SHAPE, int((lm_of >= 0).sum()))
+        self._hang(i, placed.kf, placed.T_cw, ON_SHAPE, int((lm_of >= 0).sum()))
         self._surely, self._placement = surely, placed
-        self.lost_reason.pop(i, None)
         return lm_of
 
-    def _meet_few(self, frame: FrameFeatures, T_cw: np.ndarray, kf: int) -> tuple[PoseEstimate, np.ndarray] | None:
-        """Search the frame for the landmarks around key frame `kf`; None where fewer than a pose needs are there."""
-        around = self.builder.landmarks_in(np.append(self.builder.joined_by_edges(np.array([kf])), kf))
-        return self._meet_local_map(frame, T_cw, around, wanted=4) if len(around) and len(frame) else None
+    def _references(self, i: int, T_cw: np.ndarray) -> Iterator[int]:
+        """Give the key frames that frame `i`, near T_cw, may be aligned with: that of the latest frame, then those around."""
+        kf = int(self.ref_kf[self._latest])
+        yield kf
+        around = self.shape.around(se3.inverse(T_cw), int(self.builder.kf.segment[kf]))
+        yield from around[around != kf][:SEARCH_KEY_FRAMES].tolist()
+
+    def _meet_few(self, frame: FrameFeatures, placed: Placement) -> tuple[PoseEstimate, np.ndarray] | None:
+        """Search the frame for the landmarks around the key frame it was aligned with; None where fewer than a few agree, or shape does not."""
+        around = self.builder.landmarks_in(np.append(self.builder.joined_by_edges(np.array([placed.kf])), placed.kf))
+        if len(around) == 0 or len(frame) < FEW:
+            return None
+        found = self._meet_local_map(frame, placed.T_cw, around, wanted=FEW)
+        return found if found is not None and placed.fits(found[0].T_cw) else None
 
     def _initial_pose(self, i: int, frame: FrameFeatures) -> tuple[np.ndarray | None, np.ndarray]:
         """Guess from the features matched to the previous frame, by P3P in RANSAC; else from the motion before it.

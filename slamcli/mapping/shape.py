@@ -1,6 +1,7 @@
 """Frames and key frames placed by the shape that their depth images show, where texture ends."""
 
 from collections import OrderedDict
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +18,7 @@ LEAST_POINTS = 0.05  # share of the coarse pixels that must show a surface
 KEPT = 48  # reliefs, of half a megabyte each
 MIN_AGREEMENT = 0.6  # of the points that meet: less, and it is another place, or the start was too far off
 MIN_OVERLAP = 0.15  # of the points of a key frame, that a frame must still show
+FIT_CHI2 = 50.0  # three times the 99 % quantile of six directions: shape's information is a guess
 JOIN_OVERLAP = 0.25  # that two key frames need for an edge
 JOIN_M, JOIN_COSINE = 1.2, 0.6  # key frames farther apart, or turned by more, are not looked at
 JOIN_MOST = 5  # edges of a new key frame to earlier ones: more of them hold down the drift of a chain
@@ -70,6 +72,11 @@ class Placement:
         """Say whether the two depth images show the same place."""
         return self.alignment.agreement >= MIN_AGREEMENT and self.alignment.overlap >= MIN_OVERLAP
 
+    def fits(self, T_cw: np.ndarray) -> bool:
+        """Say whether another pose of the frame contradicts nothing that shape says."""
+        e = se3.log(T_cw @ se3.inverse(self.T_cw))
+        return bool(e @ self.alignment.information @ e < FIT_CHI2)
+
 
 class Shape:
     """Places frames by aligning their depth images with those of key frames."""
@@ -99,6 +106,28 @@ class Shape:
                 break
         return placement
 
+    def find(
+        self, frame: int, kfs: Iterable[int], starts: list[np.ndarray], landmarks: Callable[[Placement], tuple | None]
+    ) -> Placement | None:
+        """Align a frame with one key frame after the other, until one determines its pose; else give the best placement.
+
+        landmarks : gives, first, the pose estimate of the landmarks found around a placement, None where there are too few
+        """
+        if self._reliefs.of(frame) is None:
+            return None
+        best = None
+        for kf in kfs:
+            placed = self.place(frame, kf, starts)
+            if placed is not None and placed.is_sound and placed.n_determined < 6:
+                few = landmarks(placed)
+                if few is not None:
+                    placed = self.place(frame, kf, [placed.T_cw], (few[0].T_cw, few[0].information))
+            if placed is not None and placed.is_sound and (best is None or placed.n_determined > best.n_determined):
+                best = placed
+            if best is not None and best.n_determined == 6:
+                break
+        return best
+
     def fixes_all(self, frame: int) -> bool:
         """Say whether the shape that a frame shows determines all directions of motion, so that a map can begin with it."""
         # Not by itself: the errors of its normals would agree, and a wall would seem rough.
@@ -111,7 +140,9 @@ class Shape:
     def join(self, kf: int) -> int:
         """Add edges between a key frame and the earlier ones around that show the same; returns how many."""
         n = 0
-        for other in self._around(kf):
+        table = self._builder.kf
+        around = self.around(table.T_wk[kf], int(table.segment[kf]))
+        for other in around[around < kf]:
             n += self.join_pair(kf, int(other))
             if n == JOIN_MOST:
                 break
@@ -129,12 +160,10 @@ class Shape:
         self._builder.add_edge(kf_i, kf_j, found.T_ij, found.information)
         return True
 
-    def _around(self, kf: int) -> np.ndarray:
-        """Give the earlier key frames of the segment that stand and look nearly as `kf` does, nearest first."""
+    def around(self, T_wc: np.ndarray, segment: int) -> np.ndarray:
+        """Give the key frames of a segment that stand and look nearly as a camera at T_wc does, nearest first."""
         table = self._builder.kf
-        T_wk = table.T_wk[:kf]
-        apart = np.linalg.norm(T_wk[:, :3, 3] - table.T_wk[kf, :3, 3], axis=1)
-        cosine = T_wk[:, :3, 2] @ table.T_wk[kf, :3, 2]
-        is_near = (table.segment[:kf] == table.segment[kf]) & (apart < JOIN_M) & (cosine > JOIN_COSINE)
-        near = np.flatnonzero(is_near)
+        apart = np.linalg.norm(table.T_wk[:, :3, 3] - T_wc[:3, 3], axis=1)
+        cosine = table.T_wk[:, :3, 2] @ T_wc[:3, 2]
+        near = np.flatnonzero((table.segment == segment) & (apart < JOIN_M) & (cosine > JOIN_COSINE))
         return near[np.argsort(apart[near] + (1.0 - cosine[near]), kind="stable")]

@@ -1,5 +1,7 @@
 """Build a map from one frame after the other: find the pose, decide on a key frame, begin a new segment where tracking is lost for good."""
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from slamcli.config import SensorConfig, TrackConfig
@@ -10,7 +12,7 @@ from slamcli.mapping.localiser import NO_RELIEFS, Localiser, frame_features, wor
 from slamcli.mapping.mapbuilder import MapBuilder
 from slamcli.mapping.projection import FrameFeatures
 from slamcli.mapping.shape import Reliefs
-from slamcli.schema import KEY_FRAME, LOST, ON_SHAPE, Features, Map, Matches, Words
+from slamcli.schema import KEY_FRAME, LOST, ON_SHAPE, TRACKED, Features, Map, Matches, Words
 
 SHAPE_M, SHAPE_RAD = 0.3, 0.26  # a frame on shape that has moved or turned so far from its key frame becomes one
 CROWD_M, CROWD_COSINE = 0.1, 0.9945  # key frames nearer than this, and turned by less than 6 degrees, stand in the same place
@@ -69,6 +71,18 @@ class Tracker(Localiser):
         if 0 < self.settings.segment_after <= self._n_lost:
             return self._start_segment(i, frame)
         return np.full(len(frame), -1, dtype=np.int32)
+
+    def _references(self, i: int, T_cw: np.ndarray) -> Iterator[int]:
+        """Give the key frames that frame `i` may be aligned with; where the first does not do, the frame before becomes one.
+
+        That shows most of what frame `i` does, and the less the two views part, the better a motion is determined.
+        """
+        references = super()._references(i, T_cw)
+        yield next(references)
+        if self._surely == i - 1 and self.state[i - 1] in (TRACKED, ON_SHAPE):
+            self._lm_of_previous = self._add_key_frame(i - 1, self._previous, self.pose_of(i - 1), self._lm_of_previous)
+            yield int(self.ref_kf[i - 1])
+        yield from references
 
     def _start_segment(self, i: int, frame: FrameFeatures) -> np.ndarray:
         """Make frame `i` the first key frame of a new segment if it sees enough with depth."""
