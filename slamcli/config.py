@@ -109,6 +109,12 @@ class TrackConfig:
     key_frame_share: float = option(0.6, "a frame that holds less of its reference key frame's landmarks becomes one", gt=0, le=1)
     key_frame_gap: int = option(8, "frames between key frames at most", ge=1)
     key_frame_crowd: int = option(12, "unless so many stand within 0.1 m and 6 degrees of the frame already", ge=1)
+    shape_below: int = option(
+        150, "a pose that rests on fewer landmarks is found by aligning the shapes that depth shows; 0 = only where features fail", ge=0
+    )
+    shape_hold: float = option(
+        1.0, "where shape leaves a direction open, as along a flat wall, it is taken from the motion before it for so long [s]", ge=0, le=10
+    )
     share_key_frames: int = option(10, "neighbours in which a new key frame's landmarks are looked for", ge=0)
     share_max_distance: int = option(50, "descriptors that differ more are not one landmark [bits]", ge=1, le=256)
     window_key_frames: int = option(12, "key frames adjusted with each new one", ge=2)

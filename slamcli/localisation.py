@@ -15,9 +15,10 @@ from slamcli.mapping import hindsight, selfcalibration, timing
 from slamcli.mapping.localiser import Localiser
 from slamcli.mapping.mapbuilder import MapBuilder
 from slamcli.mapping.selfcalibration import Sensing
+from slamcli.mapping.shape import Reliefs
 from slamcli.pipeline import Pipeline
 from slamcli.rundir import RunDir
-from slamcli.schema import LOST, Features, Map, Matches, Timing, Tracks, Trajectory, Words, trajectory
+from slamcli.schema import LOST, CoarseDepth, Features, Map, Matches, Timing, Tracks, Trajectory, Words, trajectory
 
 LOOKS = 2  # at all frames with hindsight: the motion that rectifies them comes from the look before
 
@@ -75,6 +76,8 @@ def _find(run: RunDir, new: RunDir, config: Config, progress: Progress) -> Local
         config.track,
         config.sensor,
         np.random.default_rng(config.seed),
+        reliefs=Reliefs(new.load(CoarseDepth, "extract"), camera, config.sensor),
+        map_reliefs=Reliefs(run.load(CoarseDepth, "extract"), run.camera(), config.sensor),
     )
     for i in progress(range(len(features.stamp)), "localize"):
         localiser.process(i)

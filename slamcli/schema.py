@@ -1,6 +1,6 @@
 """The core types. Each is a frozen record of arrays and, saved as a folder of `.npy`, also an artefact's schema.
 
-F frames, M features, P pairs, Q matches, W words, B word-vector entries, K key frames, L landmarks, O observations, C closures.
+F frames, V x U coarse pixels, M features, P pairs, Q matches, W words, B word-vector entries, K key frames, L landmarks, O observations, E edges, C closures.
 Missing values: depth and pose NaN, index -1. `offset` columns delimit ragged rows: those of frame i are offset[i]:offset[i+1].
 """
 
@@ -12,9 +12,16 @@ import numpy as np
 FORMAT = 3  # of everything a run directory holds; raised whenever an array changes its meaning
 
 
-def array(dtype: str, shape: str, meaning: str) -> Any:
-    """Declare a field: numpy dtype, symbolic shape such as "M 2" or "F+1" ("" for a scalar), meaning with unit."""
-    return field(metadata={"dtype": np.dtype(dtype), "shape": tuple(shape.split()), "meaning": meaning})
+def array(dtype: str, shape: str, meaning: str, *, may_lack: bool = False) -> Any:
+    """Declare a field: numpy dtype, symbolic shape such as "M 2" or "F+1" ("" for a scalar), meaning with unit.
+
+    may_lack : where the field is not given, it has no rows
+    """
+    symbols = tuple(shape.split())
+    metadata = {"dtype": np.dtype(dtype), "shape": symbols, "meaning": meaning}
+    if may_lack:
+        return field(default_factory=lambda: np.zeros([int(s) if s.isdigit() else 0 for s in symbols], dtype), metadata=metadata)
+    return field(metadata=metadata)
 
 
 @dataclass(frozen=True)
@@ -30,6 +37,13 @@ class Features:
     angle: np.ndarray = array("f4", "M", "rad, of the intensity centroid")
     desc: np.ndarray = array("u1", "M 32", "ORB descriptor, 256 bits")
     octave_scale: np.ndarray = array("f8", "", "size ratio of neighbouring pyramid levels")
+
+
+@dataclass(frozen=True)
+class CoarseDepth:
+    """What of the depth images suffices to align shapes, by extract: places without texture are tracked on it."""
+
+    coarse_depth: np.ndarray = array("u2", "F V U", "2e-4 m along the optical axis, of the middle of a block of pixels, 0 = none")
 
 
 @dataclass(frozen=True)
@@ -56,7 +70,7 @@ class Matches:
     distance: np.ndarray = array("u1", "Q", "Hamming distance, bits")
 
 
-LOST, TRACKED, KEY_FRAME, RELOCALISED = 0, 1, 2, 3  # values of Tracks.state
+LOST, TRACKED, KEY_FRAME, RELOCALISED, ON_SHAPE = range(5)  # values of Tracks.state
 
 
 @dataclass(frozen=True)
@@ -65,13 +79,13 @@ class Tracks:
 
     ref_kf: np.ndarray = array("i4", "F", "row in Map of the key frame a frame hangs on, -1 = lost")
     T_kc: np.ndarray = array("f8", "F 4 4", "frame's camera to that key frame's camera, NaN = lost")
-    state: np.ndarray = array("u1", "F", "0 lost, 1 tracked, 2 key frame, 3 relocalised")
+    state: np.ndarray = array("u1", "F", "0 lost, 1 tracked, 2 key frame, 3 relocalised, 4 tracked on the shape that depth shows")
     n_inliers: np.ndarray = array("i4", "F", "landmarks the pose rests on")
 
 
 @dataclass(frozen=True)
 class Map:
-    """Key frames, landmarks and the observations that join them.
+    """Key frames, landmarks and the observations that join them, and edges between key frames that shape joins.
 
     Where tracking was lost for good, a new segment begins. Each has a world of its own, and nothing joins two segments: key frames and
     landmarks of one cannot be compared with those of another. Segment 0 is the one that most frames belong to.
@@ -84,6 +98,9 @@ class Map:
     obs_lm: np.ndarray = array("i4", "O", "sorted by (landmark, key frame), pairs unique")
     obs_kf: np.ndarray = array("i4", "O", "row in kf_frame")
     obs_row: np.ndarray = array("i8", "O", "row in Features")
+    edge_kf: np.ndarray = array("i4", "E 2", "key frames (i, j), j < i, whose depth images were aligned", may_lack=True)
+    edge_T_ij: np.ndarray = array("f8", "E 4 4", "x_i = T_ij @ x_j, as aligned", may_lack=True)
+    edge_information: np.ndarray = array("f8", "E 6 6", "1/m^2, 1/rad^2, of the left twist of T_ij", may_lack=True)
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from slamcli import artifacts
 from slamcli.config import LoopConfig, OptimizeConfig, SensorConfig, TrackConfig
 from slamcli.files import read_json
 from slamcli.geometry.camera import Camera
-from slamcli.schema import Features, Map, Matches, Tracks, Words
+from slamcli.schema import CoarseDepth, Features, Map, Matches, Tracks, Words
 
 SENSOR = SensorConfig(pixel_noise=0.5)
 
@@ -21,10 +21,11 @@ class Run:
         self.scene, self.folder, self.given, self.warnings = scene, folder, given, []
         optimize = optimize or OptimizeConfig()
         self.cfg = SimpleNamespace(track=TrackConfig(), sensor=SENSOR, optimize=optimize, loop=LoopConfig(**loop_settings))
+        self.depth = CoarseDepth(np.zeros((len(scene.features.stamp), 0, 0), np.uint16))
         self.warn, self.summary = self.warnings.append, {}
 
     def load(self, cls, stage):
-        given = {Features: self.scene.features, Words: self.scene.words, Matches: self.scene.matches}
+        given = {Features: self.scene.features, Words: self.scene.words, Matches: self.scene.matches, CoarseDepth: self.depth}
         return given[cls] if cls in given else artifacts.load(cls, self.folder / stage)
 
     def camera(self, stage="extract"):

@@ -97,7 +97,7 @@ def test_key_frames_are_ordered_into_a_band():
     rng = np.random.default_rng(0)
     shuffled = rng.permutation(80)
     obs_kf = np.concatenate([shuffled[k : k + 3] for k in range(78)])
-    place, system = reduced_system.order_and_blocks(np.arange(80), obs_kf, np.repeat(np.arange(78), 3), 80)
+    place, system = reduced_system.order_and_blocks(np.arange(80), obs_kf, np.repeat(np.arange(78), 3), 80, np.empty((0, 2), dtype=int))
     assert system.form == "band" and system.bandwidth <= 6 * 4 + 5
     assert (np.abs(np.diff(place[shuffled])) <= 4).all()
 

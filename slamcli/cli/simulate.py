@@ -22,7 +22,8 @@ import click
 @click.option("--noise", type=click.Choice(["kinect", "none"]), default="kinect", show_default=True, help="none: exact images.")
 @click.option("--depth-min", default=0.4, show_default=True, help="Nearest reading of the noisy camera [m].")
 @click.option("--depth-max", default=5.0, show_default=True, help="Farthest reading of the noisy camera [m].")
-@click.option("--textured", default=1.0, show_default=True, help="Share of objects and walls with a picture; 0 = shading only.")
+@click.option("--textured", default=1.0, show_default=True, help="Share of objects and walls with a picture; 0 = plain colours, shaded.")
+@click.option("--dark", is_flag=True, help="No lamp: nothing but noise in the colour images; depth brings its own light.")
 @click.option("--moved-object", "movable", is_flag=True, help="A parcel is taken away half-way.")
 @click.option(
     "--alias", type=click.Choice(["posters", "corridor"]), default=None, help="Places that look alike: opposite walls, equal doors."

@@ -49,6 +49,7 @@ class Simulation:
     depth_min: float = 0.4  # of the noisy camera
     depth_max: float = 5.0
     textured: float = 1.0  # share of objects and walls with a picture on them
+    dark: bool = False  # nothing but noise in the colour images; depth brings its own light
     movable: bool = False  # a parcel that is gone in the second half
     alias: str = ""  # "posters": opposite walls are the same; "corridor": equal doors
     room: tuple[float, float] = (8.0, 5.0)
@@ -184,6 +185,8 @@ def _write_images(folder: Path, what: Simulation, scene: Scene, motion: Motion, 
         rgb, depth, cosine = renderer.render(motion.colour_T_lc[i], with_movable=shown)
         if not has_one_clock:
             depth, cosine = renderer.depth(motion.depth_T_lc[i], with_movable=shown)
+        if what.dark:
+            rgb = np.zeros_like(rgb)
         if what.noise == "kinect":
             depth = noise.depth_noise(depth, cosine, what.camera().fx, sensor, normal_noise, rng)
             picture = noise.colour_noise(rgb, sensor, normal_noise, rng)

@@ -8,6 +8,7 @@ from slamcli.config import SensorConfig
 from slamcli.geometry import se3
 from slamcli.geometry.camera import Camera
 from slamcli.mapping import bundle, noise
+from slamcli.mapping.bundle_edges import Edges
 from slamcli.mapping.mapbuilder import MapBuilder
 from slamcli.schema import Features
 
@@ -46,6 +47,7 @@ class Part:
     obs_lm: np.ndarray  # (O,) index into ids, increasing
     row: np.ndarray  # (O,) feature row
     measured: Measurements
+    edges: Edges  # between key frames of kfs
 
     @property
     def arguments(self) -> tuple:
@@ -54,7 +56,7 @@ class Part:
 
 
 def gather(builder: MapBuilder, moving: np.ndarray, sensor: SensorConfig) -> Part:
-    """Gather the key frames `moving` and all they see; key frames outside that see the same are held fixed.
+    """Gather the key frames `moving` and all they see; key frames outside that see the same, or that edges join to them, are held fixed.
 
     In a segment where none is held so, the oldest of `moving` is, which fixes the gauge.
     """
@@ -62,12 +64,14 @@ def gather(builder: MapBuilder, moving: np.ndarray, sensor: SensorConfig) -> Par
     is_single = builder.lm.n_obs[ids] < 2
     shared = ids[~is_single]
     obs_lm, obs_kf, row = builder.observations_of(shared)
-    kfs = np.union1d(moving, obs_kf)
+    kfs = np.union1d(np.union1d(moving, obs_kf), builder.joined_by_edges(moving))
     is_fixed = ~np.isin(kfs, moving)
     segments, oldest = np.unique(builder.kf.segment[kfs], return_index=True)
     is_fixed[oldest[~np.isin(segments, builder.kf.segment[kfs[is_fixed]])]] = True
     kf_index = np.searchsorted(kfs, obs_kf).astype(np.int32)
-    return Part(kfs, is_fixed, shared, ids[is_single], kf_index, obs_lm, row, measure(builder.features, row, sensor))
+    is_inside = np.isin(builder.edge.kf, kfs).all(axis=1) & np.isin(builder.edge.kf, moving).any(axis=1)
+    edges = Edges(np.searchsorted(kfs, builder.edge.kf[is_inside]), builder.edge.T_ij[is_inside], builder.edge.information[is_inside])
+    return Part(kfs, is_fixed, shared, ids[is_single], kf_index, obs_lm, row, measure(builder.features, row, sensor), edges)
 
 
 def adjust(
@@ -78,7 +82,7 @@ def adjust(
     Returns the evidence, or None where nothing ties two key frames together.
     """
     part = gather(builder, moving, sensor)
-    if len(part.row) == 0:
+    if len(part.row) == 0 and len(part.edges) == 0:
         return None
     result = bundle.adjust(
         builder.T_kw(part.kfs),
@@ -86,6 +90,7 @@ def adjust(
         *part.arguments,
         camera,
         is_fixed=part.is_fixed,
+        edges=part.edges,
         max_iterations=max_iterations,
     )
     before = builder.kf.T_wk[part.kfs].copy()

@@ -10,6 +10,7 @@ import numpy as np
 from slamcli.geometry import se3
 from slamcli.geometry.camera import Camera
 from slamcli.mapping import bundle_kernels as kernels
+from slamcli.mapping.bundle_edges import NO_EDGES, Edges, EdgeTerms
 from slamcli.mapping.pose import CHI2_95_2DOF, CHI2_95_3DOF
 from slamcli.mapping.reduced_system import Factor, order_and_blocks
 
@@ -68,6 +69,7 @@ def adjust(
     camera: Camera,
     *,
     is_fixed: np.ndarray,
+    edges: Edges = NO_EDGES,
     max_iterations: int = 10,
     robust: bool = True,
     outlier_iterations: int = 0,
@@ -81,14 +83,15 @@ def adjust(
     T_cw : (K, 4, 4); x_w : (L, 3) [m]; is_fixed : (K,) bool, key frames that stay
     obs_kf, obs_lm : (O,) key frame and landmark of each observation, sorted by landmark
     xy : (O, 2) [px, undistorted]; depth : (O,) [m], NaN = bearing only; sigma_px, sigma_z : (O,) [px, m] standard deviations
+    edges : relative poses of key frames that were measured besides
 
-    Minimises the sum over observations of Huber's function of chi2 = |xy - pi(x)|^2 / sigma_px^2 + (depth - z)^2 / sigma_z^2, which is
+    Minimises the sum over observations and edges of Huber's function of chi2, for observations = |xy - pi(x)|^2 / sigma_px^2 + (depth - z)^2 / sigma_z^2, which is
     chi2 up to its 95 % quantile and then grows like its root. With `outlier_iterations`, observations beyond the quantile after
     `max_iterations` are dropped and that many iterations follow without them. An iteration ends the adjustment when it lowers the cost
     by less than the share `tolerance`. A landmark seen once is adjusted with its depth; with one bearing alone it bears on nothing.
     Values that are not finite switch their observation off.
     """
-    problem = Problem(T_cw, x_w, obs_kf, obs_lm, xy, depth, sigma_px, sigma_z, camera, is_fixed)
+    problem = Problem(T_cw, x_w, obs_kf, obs_lm, xy, depth, sigma_px, sigma_z, camera, is_fixed, edges)
     quantiles = np.array([chi2_px, chi2_depth], dtype=np.float64)
     limits = quantiles if robust else np.array([np.inf, np.inf])
     T, x, cost, iterations, is_converged = _minimise(problem, problem.T, problem.x, limits, max_iterations, tolerance)
@@ -140,7 +143,7 @@ def _minimise(
 class Problem:
     """The observations as the kernels want them, and the work space of the normal equations."""
 
-    def __init__(self, T_cw, x_w, obs_kf, obs_lm, xy, depth, sigma_px, sigma_z, camera, is_fixed) -> None:
+    def __init__(self, T_cw, x_w, obs_kf, obs_lm, xy, depth, sigma_px, sigma_z, camera, is_fixed, edges: Edges = NO_EDGES) -> None:
         obs_kf, obs_lm = np.asarray(obs_kf, dtype=np.int64), np.asarray(obs_lm, dtype=np.int64)
         if (np.diff(obs_lm) < 0).any():
             raise ValueError("observations must be sorted by landmark")
@@ -151,8 +154,10 @@ class Problem:
         measured = _measurements(xy, depth, sigma_px, sigma_z, self.is_finite_landmark[obs_lm])
         in_use = measured[:, 3] > 0.0
         n_seen = np.bincount(obs_kf[in_use], minlength=len(self.T))
+        n_seen += FEW_OBSERVATIONS * np.bincount(edges.kf.ravel(), minlength=len(self.T))  # an edge determines a pose by itself
         free = np.flatnonzero(~np.asarray(is_fixed, dtype=bool) & (n_seen > 0))
-        self.place, self.system = order_and_blocks(free, obs_kf, obs_lm, len(self.T))
+        self.place, self.system = order_and_blocks(free, obs_kf, obs_lm, len(self.T), edges.kf)
+        self.edge_terms = EdgeTerms(edges, self.place, self.system.block_of)
         self.offset = np.searchsorted(obs_lm, np.arange(len(self.x) + 1)).astype(np.int64)
         self.order = _stable_order(obs_lm * (len(self.T) + 1) + self.place[obs_kf] + 1)
         self.measured = measured[self.order]
@@ -181,7 +186,7 @@ class Problem:
 
     def cost(self, T: np.ndarray, x: np.ndarray, limits: np.ndarray) -> float:
         """Give the sum of Huber's costs; limits : (2,) chi2 from which it grows like the root, without and with depth."""
-        return self._evaluate(T, x, limits)[0]
+        return self._evaluate(T, x, limits)[0] + self.edge_terms.cost(T, np.isfinite(limits).all())
 
     def chi2(self, T: np.ndarray, x: np.ndarray) -> np.ndarray:
         """Give chi2 (O,), inf where switched off or behind the camera."""
@@ -194,12 +199,14 @@ class Problem:
             block.fill(0.0)
         observations = (self.obs_kf, self.offset, self.place, self.measured, self.camera)
         kernels.linearize(T, x, *observations, limits, self.U, self.b_c, self.V, self.b_l, self.W)
+        self.edge_terms.linearize(T, np.isfinite(limits).all(), self.U, self.b_c)
 
     def eliminate(self, damping: float, hold: np.ndarray) -> None:
         """Fill the reduced camera system from them: `system.blocks`, rhs, V_inv."""
         self.system.blocks.fill(0.0)
         blocks = (self.U, self.b_c, self.V, self.b_l, self.W, self.obs_kf, self.offset, self.place)
         kernels.eliminate(*blocks, damping, hold, self.system.block_of, self.system.blocks, self.rhs, self.V_inv, self.Y)
+        self.edge_terms.add_to(self.system.blocks)
 
     def step(self, T: np.ndarray, x: np.ndarray, damping: float, T_new: np.ndarray, x_new: np.ndarray) -> float:
         """Write poses and landmarks after one damped step; return the decrease of the cost to be expected, NaN where none was found."""

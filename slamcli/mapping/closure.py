@@ -17,6 +17,7 @@ from slamcli.vision import hamming, vocabulary
 # Between neighbours that share 100 landmarks [m, rad]. In simulated rooms the drift over 20 to 50 key frames is a fourth to an eighth of
 # what follows from it: a true closure must not be dropped where tracking was poor, and a false one is metres off.
 ODOMETRY_SIGMA = np.array([0.02, 0.02, 0.02, 0.01, 0.01, 0.01])
+SHAPE_SUPPORT = 100  # landmarks that two depth images aligned are worth in the pose graph
 AHEAD = 2.0  # [m] before the camera, what it looks at
 MIN_COSINE = 0.7  # between the directions of two views of one spot
 
@@ -221,13 +222,15 @@ def reject(candidate: Candidate, reason: str) -> Candidate:
 
 
 def covisibility_edges(builder: MapBuilder, settings: LoopConfig) -> tuple[np.ndarray, np.ndarray]:
-    """Give pairs of key frames (E, 2) that share landmarks, and how many; neighbours in time within a segment always belong."""
+    """Give pairs of key frames (E, 2) that share landmarks or a shape, and how many; neighbours in time within a segment always belong."""
     edges, weights = [], []
     for i in range(1, len(builder.kf)):
         shared = builder.votes(builder.landmarks_of(i))[:i]
         joined = np.flatnonzero(shared >= settings.edge_shared)
         before = np.flatnonzero(builder.kf.segment[:i] == builder.kf.segment[i])[-1:]
-        joined = np.union1d(joined[np.argsort(-shared[joined], kind="stable")[: settings.edges_per_key_frame]], before)
+        on_shape = builder.edge.kf[builder.edge.kf[:, 0] == i, 1]
+        shared[on_shape] = np.maximum(shared[on_shape], SHAPE_SUPPORT)
+        joined = np.union1d(joined[np.argsort(-shared[joined], kind="stable")[: settings.edges_per_key_frame]], np.append(before, on_shape))
         edges += [(i, int(j)) for j in joined]
         weights += [max(int(shared[j]), 1) for j in joined]
     return np.array(edges, dtype=np.int32).reshape(-1, 2), np.array(weights, dtype=np.float64)

@@ -8,7 +8,7 @@ from slamcli.geometry.camera import Camera
 from slamcli.mapping import projection
 from slamcli.mapping.localiser import estimate_pose, frame_features
 from slamcli.mapping.mapbuilder import MapBuilder
-from slamcli.schema import KEY_FRAME, LOST, RELOCALISED, Features, Tracks
+from slamcli.schema import KEY_FRAME, LOST, ON_SHAPE, RELOCALISED, Features, Tracks
 
 NEIGHBOURS = 20  # covisible key frames whose landmarks are looked for
 LOST_WIDENING = 8.0  # a lost frame's neighbour stands where a frame's fast turn leaves it, some tens of pixels off
@@ -25,7 +25,7 @@ def refine_frames(
     look = _Look(builder, features, tracks, camera, sensor, settings)
     n = len(tracks.state)
     for i in progress(range(n), "hindsight"):
-        if tracks.state[i] not in (LOST, KEY_FRAME):
+        if tracks.state[i] not in (LOST, KEY_FRAME, ON_SHAPE):  # the few landmarks around a frame on shape would make its pose worse
             look.at(i, look.T_wc[i], int(tracks.ref_kf[i]))
     for order, step in ((range(n), -1), (range(n - 1, -1, -1), 1)):
         for i in order:  # a lost frame begins where its neighbour in time stands

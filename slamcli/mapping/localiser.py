@@ -1,5 +1,8 @@
 """Find the poses of frames, one after the other, in a map that is already there."""
 
+from collections.abc import Iterator
+from functools import partial
+
 import numpy as np
 
 from slamcli.config import SensorConfig, TrackConfig
@@ -9,8 +12,16 @@ from slamcli.mapping import adjustment, pose, projection
 from slamcli.mapping.mapbuilder import MapBuilder
 from slamcli.mapping.pose import PoseEstimate
 from slamcli.mapping.projection import FrameFeatures
-from slamcli.schema import LOST, RELOCALISED, TRACKED, Features, Matches, Tracks, Words
+from slamcli.mapping.shape import NoReliefs, Placement, Reliefs, Shape
+from slamcli.schema import LOST, ON_SHAPE, RELOCALISED, TRACKED, Features, Matches, Tracks, Words
 from slamcli.vision import hamming, vocabulary
+
+NO_RELIEFS = NoReliefs()
+SEARCH_KEY_FRAMES = 3  # around, that a frame is aligned with when the key frame before it does not do
+FEW = 10  # landmarks that help shape; fewer are found anywhere
+SEARCH_SECONDS = 2.0  # after so long without a pose, what looks like the shape around the last one may be any placeSEARCH_KEY_FRAMES = 2  # around, that such a frame is aligned with when the key frame before does not do
+# [1/m^2, 1/rad^2] what is known of the motion from one frame to the next when it goes on as before: within 10 mm and 0.6 degrees.
+STEADY = 1e4 * np.eye(6)
 
 
 def frame_features(features: Features, frame: int, camera: Camera, sensor: SensorConfig) -> FrameFeatures:
@@ -61,8 +72,14 @@ class Localiser:
         settings: TrackConfig,
         sensor: SensorConfig,
         rng: np.random.Generator,
+        *,
+        reliefs: Reliefs = NO_RELIEFS,
+        map_reliefs: Reliefs = NO_RELIEFS,
     ):
-        """Take the map with the words of its features, and a recording's features, words and matches of neighbouring frames."""
+        """Take the map with the words of its features, and a recording's features, words and matches of neighbouring frames.
+
+        reliefs, map_reliefs : of that recording, and of the one that the map is of; without them, texture alone is followed
+        """
         self.builder, self.map_words = builder, map_words
         self.features, self.words, self.matches = features, words, matches
         self.camera, self.settings, self.sensor, self.rng = camera, settings, sensor, rng
@@ -76,6 +93,9 @@ class Localiser:
         self.state = np.full(n, LOST, dtype=np.uint8)
         self.n_inliers = np.zeros(n, dtype=np.int32)
         self.lost_reason: dict[int, str] = {}
+        self.shape = Shape(builder, map_reliefs, reliefs)
+        self._latest = self._surely = -1  # frame that has a pose, and frame all of whose pose was measured
+        self._placement: Placement | None = None  # of the latest frame, where it rests on shape
         self._pair_of = {(int(i), int(j)): p for p, (i, j) in enumerate(matches.pair)}
         self._previous: FrameFeatures | None = None
         self._lm_of_previous = np.empty(0, dtype=np.int32)  # landmark of each feature of the previous frame, -1 = none
@@ -99,28 +119,84 @@ class Localiser:
 
     def _locate(self, i: int, frame: FrameFeatures) -> np.ndarray:
         """Find the pose of frame `i`; returns the landmark of each of its features, none where it is lost."""
-        nothing = np.full(len(frame), -1, dtype=np.int32)
-        if len(frame) < self.settings.min_inliers:
-            self.lost_reason[i] = f"{len(frame)} features: blank or unreadable image"
-            return nothing
-        state = TRACKED
-        T_cw, ids = self._initial_pose(i, frame)
-        found = self._meet_local_map(frame, T_cw, ids, wanted=self.settings.min_inliers) if T_cw is not None else None
-        if found is None:
+        state, found = TRACKED, None
+        if len(frame) >= self.settings.min_inliers:
+            T_cw, ids = self._initial_pose(i, frame)
+            found = self._meet_local_map(frame, T_cw, ids, wanted=self.settings.min_inliers) if T_cw is not None else None
+        if found is None or found[0].n_inliers < self.settings.shape_below:
+            lm_of = self._locate_on_shape(i, frame, found)
+            if lm_of is not None:
+                return lm_of
+        if found is None and len(frame) >= self.settings.min_inliers:
             T_cw, ids = self._relocalise(i, frame)
             found = self._meet_local_map(frame, T_cw, ids, wanted=self.settings.relocalise_inliers) if T_cw is not None else None
             state = RELOCALISED
         if found is None:
-            self.lost_reason[i] = f"fewer than {self.settings.min_inliers} of {len(frame)} features agree with the map"
-            return nothing
+            self.lost_reason.setdefault(i, self._why_lost(frame))
+            return np.full(len(frame), -1, dtype=np.int32)
         estimate, lm_of = found
         self._record(i, estimate, lm_of, state)
         return lm_of
 
+    def _why_lost(self, frame: FrameFeatures) -> str:
+        if len(frame) < self.settings.min_inliers:
+            return f"{len(frame)} features: blank or unreadable image"
+        return f"fewer than {self.settings.min_inliers} of {len(frame)} features agree with the map"
+
     def _record(self, i: int, estimate: PoseEstimate, lm_of: np.ndarray, state: int) -> None:
         kf = int(np.argmax(self.builder.votes(lm_of[lm_of >= 0])))
-        self.ref_kf[i], self.state[i], self.n_inliers[i] = kf, state, estimate.n_inliers
-        self.T_kc[i] = se3.inverse(estimate.T_cw @ self.builder.kf.T_wk[kf])
+        self._hang(i, kf, estimate.T_cw, state, estimate.n_inliers)
+
+    def _hang(self, i: int, kf: int, T_cw: np.ndarray, state: int, n_inliers: int) -> None:
+        self.ref_kf[i], self.state[i], self.n_inliers[i], self._latest, self._surely = kf, state, n_inliers, i, i
+        self.lost_reason.pop(i, None)
+        self.T_kc[i] = se3.inverse(T_cw @ self.builder.kf.T_wk[kf])
+
+    def _locate_on_shape(self, i: int, frame: FrameFeatures, found: tuple[PoseEstimate, np.ndarray] | None) -> np.ndarray | None:
+        """Align frame `i` with the key frame that the frame before it hangs on, together with what landmarks there are.
+
+        found : the pose that landmarks give, and the landmark of each feature, if they give one
+        Returns the landmark of each feature; None where depth shows another place, or not enough to determine the pose.
+        """
+        self._placement = None
+        if self._latest < 0 or self.features.stamp[i] - self.features.stamp[self._latest] > SEARCH_SECONDS:
+            return None
+        T_wp = self.pose_of(self._latest)
+        expected = self._predict(i, T_wp, self._latest, reach=np.inf)
+        if found is None:
+            placed = self.shape.find(i, self._references(i, expected), [expected, se3.inverse(T_wp)], partial(self._meet_few, frame))
+        else:
+            placed = self.shape.place(i, int(self.ref_kf[self._latest]), [found[0].T_cw], (found[0].T_cw, found[0].information))
+        if placed is None or not placed.is_sound:
+            return None
+        surely = self._surely if placed.n_determined < 6 else i
+        if surely < i:
+            self.lost_reason[i] = f"the depth shows {placed.n_determined} of 6 directions only: a flat wall"
+            if found is not None or self.features.stamp[i] - self.features.stamp[surely] > self.settings.shape_hold:
+                return None
+            placed = self.shape.place(i, placed.kf, [expected], (expected, STEADY))
+            if not placed.is_sound:
+                return None
+        few = self._meet_few(frame, placed)
+        lm_of = np.full(len(frame), -1, dtype=np.int32) if few is None else few[1]
+        self._hang(i, placed.kf, placed.T_cw, ON_SHAPE, int((lm_of >= 0).sum()))
+        self._surely, self._placement = surely, placed
+        return lm_of
+
+    def _references(self, i: int, T_cw: np.ndarray) -> Iterator[int]:
+        """Give the key frames that frame `i`, near T_cw, may be aligned with: that of the latest frame, then those around."""
+        kf = int(self.ref_kf[self._latest])
+        yield kf
+        around = self.shape.around(se3.inverse(T_cw), int(self.builder.kf.segment[kf]))
+        yield from around[around != kf][:SEARCH_KEY_FRAMES].tolist()
+
+    def _meet_few(self, frame: FrameFeatures, placed: Placement) -> tuple[PoseEstimate, np.ndarray] | None:
+        """Search the frame for the landmarks around the key frame it was aligned with; None where fewer than a few agree, or shape does not."""
+        around = self.builder.landmarks_in(np.append(self.builder.joined_by_edges(np.array([placed.kf])), placed.kf))
+        if len(around) == 0 or len(frame) < FEW:
+            return None
+        found = self._meet_local_map(frame, placed.T_cw, around, wanted=FEW)
+        return found if found is not None and placed.fits(found[0].T_cw) else None
 
     def _initial_pose(self, i: int, frame: FrameFeatures) -> tuple[np.ndarray | None, np.ndarray]:
         """Guess from the features matched to the previous frame: where the motion before it does not explain them, by P3P in RANSAC.
@@ -131,7 +207,7 @@ class Localiser:
         if T_wp is None:
             return None, np.empty(0, np.int32)
         rows, x_w, ids = self._inherit(i, T_wp)
-        predicted = self._predict(i, T_wp)
+        predicted = self._predict(i, T_wp, i - 1)
         if len(rows) >= self.settings.min_inliers:
             best = estimate_pose(predicted, x_w, frame, rows, self.camera)
             if 2 * best.n_inliers <= len(rows):  # else no other pose can have as many
@@ -168,15 +244,18 @@ class Localiser:
         is_usable = np.isfinite(x_w[:, 0])
         return match[is_usable, 0], x_w[is_usable], ids[is_usable]
 
-    def _predict(self, i: int, T_wp: np.ndarray) -> np.ndarray:
-        """Give T_cw of frame `i` under the motion between the two frames before it, scaled by the time between."""
-        T_wq = self.pose_of(i - 2) if i >= 2 else None
-        if T_wq is None or self.segment_of(i - 2) != self.segment_of(i - 1):
+    def _predict(self, i: int, T_wp: np.ndarray, p: int, *, reach: float = 4.0) -> np.ndarray:
+        """Give T_cw of frame `i` under the motion between frame `p`, whose pose is T_wp, and the one before that, scaled by the time.
+
+        reach : times the time between those two, beyond which T_wp itself is given
+        """
+        T_wq = self.pose_of(p - 1) if p >= 1 else None
+        if T_wq is None or self.segment_of(p - 1) != self.segment_of(p):
             return se3.inverse(T_wp)
         stamp = self.features.stamp
-        share = (stamp[i] - stamp[i - 2]) / (stamp[i - 1] - stamp[i - 2])
+        share = (stamp[i] - stamp[p - 1]) / (stamp[p] - stamp[p - 1])
         # A gap in the recording says nothing about the motion within it.
-        return se3.inverse(se3.interpolate(T_wq, T_wp, share if share < 4.0 else 1.0))
+        return se3.inverse(se3.interpolate(T_wq, T_wp, share if share < reach else 1.0))
 
     def _relocalise(self, i: int, frame: FrameFeatures) -> tuple[np.ndarray | None, np.ndarray]:
         """Recognise a key frame by its words and find the pose in it; [Z] (10)."""

@@ -38,6 +38,7 @@ class MapBuilder:
             is_alive=("?",),
         )
         self.obs = Table(lm=("i4",), kf=("i4",), row=("i8",), next=("i4",))
+        self.edge = Table(kf=("i4", 2), T_ij=("f8", 4, 4), information=("f8", 6, 6))
         self.lm_of_row = np.full(int(features.offset[-1]), -1, dtype=np.int32)
 
     def add_key_frame(self, frame: int, T_wk: np.ndarray, segment: int = 0) -> int:
@@ -73,6 +74,15 @@ class MapBuilder:
         added = self.obs.append(len(ids), lm=ids, kf=kf, row=rows, next=-1)
         _link(self.lm.head, self.lm.n_obs, self.obs.next, self.obs.lm, added.start)
         self.lm_of_row[rows] = ids
+
+    def add_edge(self, kf_i: int, kf_j: int, T_ij: np.ndarray, information: np.ndarray) -> None:
+        """Note that shape says ``x_i = T_ij @ x_j`` of two key frames; information (6, 6) of the left twist of T_ij."""
+        self.edge.append(1, kf=(kf_i, kf_j), T_ij=T_ij, information=information)
+
+    def joined_by_edges(self, kfs: np.ndarray) -> np.ndarray:
+        """Give the key frames (N,) that edges join to any of `kfs`, these themselves left out, increasing."""
+        touches = np.isin(self.edge.kf, kfs)
+        return np.setdiff1d(self.edge.kf[touches.any(axis=1)], kfs).astype(np.int32)
 
     def rows_of(self, kf: int) -> slice:
         """Give the feature rows of a key frame."""
@@ -178,6 +188,9 @@ class MapBuilder:
             obs_lm=which,
             obs_kf=kf,
             obs_row=row,
+            edge_kf=self.edge.kf.copy(),
+            edge_T_ij=self.edge.T_ij.copy(),
+            edge_information=self.edge.information.copy(),
         )
 
     @classmethod
@@ -205,6 +218,7 @@ class MapBuilder:
         self.obs.append(len(map_.obs_lm), lm=map_.obs_lm, kf=map_.obs_kf, row=map_.obs_row, next=-1)
         _link(self.lm.head, self.lm.n_obs, self.obs.next, self.obs.lm, 0)
         self.lm_of_row[map_.obs_row] = map_.obs_lm
+        self.edge.append(len(map_.edge_kf), kf=map_.edge_kf, T_ij=map_.edge_T_ij, information=map_.edge_information)
         self.refresh(np.arange(n_lm, dtype=np.int32))
         return self
 

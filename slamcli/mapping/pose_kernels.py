@@ -7,6 +7,7 @@ sensor gave none. All arrays are C-contiguous float64 unless said otherwise.
 import numpy as np
 from numba import b1, f8, i8
 
+from slamcli.geometry.cholesky import solve_damped
 from slamcli.geometry.se3 import left_update
 from slamcli.kernels import kernel
 
@@ -154,35 +155,6 @@ def normal_equations(T, x_w, xy, depth, inv_px, inv_z, is_used, camera, chi2_px,
     H[3, 3], H[3, 4], H[3, 5], H[4, 4], H[4, 5], H[5, 5] = h33, h34, h35, h44, h45, h55
     b[0], b[1], b[2], b[3], b[4], b[5] = b0, b1, b2, b3, b4, b5
     return cost
-
-
-@kernel(error_model="numpy", fastmath={"contract"})
-def solve_damped(H, b, damping, L, out):
-    """Solve (H + damping diag H) out = b for 6 unknowns by Cholesky from H's upper triangle; False if it is not positive definite."""
-    for j in range(6):
-        for i in range(j, 6):
-            s = H[j, i]
-            if i == j:
-                s += damping * H[j, j]
-            for k in range(j):
-                s -= L[i, k] * L[j, k]
-            if i == j:
-                if not s > 1e-12 * H[j, j] or s == 0.0:
-                    return False
-                L[j, j] = np.sqrt(s)
-            else:
-                L[i, j] = s / L[j, j]
-    for i in range(6):
-        s = b[i]
-        for k in range(i):
-            s -= L[i, k] * out[k]
-        out[i] = s / L[i, i]
-    for i in range(5, -1, -1):
-        s = out[i]
-        for k in range(i + 1, 6):
-            s -= L[k, i] * out[k]
-        out[i] = s / L[i, i]
-    return True
 
 
 @kernel(error_model="numpy", fastmath={"contract"})

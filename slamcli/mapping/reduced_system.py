@@ -1,6 +1,6 @@
 """The reduced camera system of bundle adjustment: symmetric, 6 x 6 blocks, one block row per free key frame.
 
-Blocks exist where two key frames share a landmark. Key frames are put in an order in which those that share landmarks stand close, and
+Blocks exist where two key frames share a landmark or an edge. Key frames are put in an order in which those that share landmarks stand close, and
 the system is factorised as a band, or as a dense matrix where the band is wide. SuperLU took four to five times as long as the band, even
 for 1500 key frames in a band of 600. What would not fit into memory is solved by conjugate gradients, which need the blocks alone.
 """
@@ -118,10 +118,13 @@ class ReducedSystem:
         return _ConjugateGradients(bsr_array((blocks[order], column[order], start), shape=(6 * self.n, 6 * self.n)), inverse)
 
 
-def order_and_blocks(free: np.ndarray, obs_kf: np.ndarray, obs_lm: np.ndarray, n_key_frames: int) -> tuple[np.ndarray, ReducedSystem]:
-    """Order the free key frames and find which of them share landmarks.
+def order_and_blocks(
+    free: np.ndarray, obs_kf: np.ndarray, obs_lm: np.ndarray, n_key_frames: int, edge_kf: np.ndarray
+) -> tuple[np.ndarray, ReducedSystem]:
+    """Order the free key frames and find which of them share landmarks or an edge.
 
-    free : (n,) key frames; obs_kf, obs_lm : (O,) the observations. Returns `place` (K,), the block row of each key frame, -1 = not free.
+    free : (n,) key frames; obs_kf, obs_lm : (O,) the observations; edge_kf : (E, 2) key frames that edges join
+    Returns `place` (K,), the block row of each key frame, -1 = not free.
     """
     n = len(free)
     place = np.full(n_key_frames, -1, dtype=np.int64)
@@ -129,9 +132,13 @@ def order_and_blocks(free: np.ndarray, obs_kf: np.ndarray, obs_lm: np.ndarray, n
     if n < ORDER_FROM:  # nearly every pair shares a landmark: to search would cost more than to solve
         row, column = np.triu_indices(n, 1)
     else:
+        # An edge is like a landmark that both its key frames see.
+        n_landmarks = int(obs_lm.max(initial=-1)) + 1
+        obs_kf = np.concatenate([obs_kf, edge_kf.ravel()])
+        obs_lm = np.concatenate([obs_lm, n_landmarks + np.repeat(np.arange(len(edge_kf)), 2)])
         is_free = place[obs_kf] >= 0
         entries = (np.ones(is_free.sum(), dtype=np.float32), (place[obs_kf[is_free]], obs_lm[is_free]))
-        seen = csr_array(entries, shape=(n, int(obs_lm.max(initial=-1)) + 1))
+        seen = csr_array(entries, shape=(n, n_landmarks + len(edge_kf)))
         shared = (seen @ seen.T).tocsr()
         order = reverse_cuthill_mckee(shared, symmetric_mode=True)
         new_place = np.empty(n, dtype=np.int64)

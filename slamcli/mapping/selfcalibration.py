@@ -80,7 +80,7 @@ def estimate_sensing(builder: MapBuilder, given: Camera, now: Sensing, sensor: S
     if len(part.row) == 0 or not prior:
         return None
     T_kw, x_w = builder.T_kw(part.kfs), builder.lm.xyz[part.ids]
-    problem = bundle.Problem(T_kw, x_w, *part.arguments, now.camera, part.is_fixed)
+    problem = bundle.Problem(T_kw, x_w, *part.arguments, now.camera, part.is_fixed, part.edges)
     names = list(prior)
     predicted = problem.in_given_order(residuals(problem, problem.T, problem.x) + problem.measured[:, :3])
     columns = np.stack([_column(name, builder.features, part.row, predicted, now, prior[name]) for name in names], axis=2)

@@ -1,16 +1,20 @@
 """Build a map from one frame after the other: find the pose, decide on a key frame, begin a new segment where tracking is lost for good."""
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from slamcli.config import SensorConfig, TrackConfig
 from slamcli.geometry import se3
 from slamcli.geometry.camera import Camera
 from slamcli.mapping import adjustment, projection
-from slamcli.mapping.localiser import Localiser, frame_features, word_vector
+from slamcli.mapping.localiser import NO_RELIEFS, Localiser, frame_features, word_vector
 from slamcli.mapping.mapbuilder import MapBuilder
 from slamcli.mapping.projection import FrameFeatures
-from slamcli.schema import KEY_FRAME, LOST, Features, Map, Matches, Words
+from slamcli.mapping.shape import Reliefs
+from slamcli.schema import KEY_FRAME, LOST, ON_SHAPE, TRACKED, Features, Map, Matches, Words
 
+SHAPE_M, SHAPE_RAD = 0.3, 0.26  # a frame on shape that has moved or turned so far from its key frame becomes one
 CROWD_M, CROWD_COSINE = 0.1, 0.9945  # key frames nearer than this, and turned by less than 6 degrees, stand in the same place
 
 
@@ -30,8 +34,13 @@ class Tracker(Localiser):
         settings: TrackConfig,
         sensor: SensorConfig,
         rng: np.random.Generator,
+        *,
+        reliefs: Reliefs = NO_RELIEFS,
     ):
-        super().__init__(MapBuilder(features), words, features, words, matches, camera, settings, sensor, rng)
+        builder = MapBuilder(features)
+        super().__init__(
+            builder, words, features, words, matches, camera, settings, sensor, rng, reliefs=reliefs, map_reliefs=reliefs
+        )  # fmt: skip
         self.segment = -1  # that frames are added to; -1 before the first
         self._n_lost = 0  # frames in a row that saw enough and were not recognised
         self._first_lost = -1  # of these
@@ -58,7 +67,7 @@ class Tracker(Localiser):
 
     def _lose(self, i: int, frame: FrameFeatures) -> np.ndarray:
         """Count a lost frame; after too many that could have been recognised, begin a new segment. Returns the landmarks of its features."""
-        if len(frame) >= self.settings.min_inliers:
+        if len(frame) >= self.settings.min_inliers or self.shape.fixes_all(i):
             self._first_lost = i if self._n_lost == 0 else self._first_lost
             self._n_lost += 1
         if 0 < self.settings.segment_after <= self._n_lost:
@@ -76,11 +85,23 @@ class Tracker(Localiser):
             self.process(later)
         return self._lm_of_previous
 
+    def _references(self, i: int, T_cw: np.ndarray) -> Iterator[int]:
+        """Give the key frames that frame `i` may be aligned with; where the first does not do, the frame before becomes one.
+
+        That shows most of what frame `i` does, and the less the two views part, the better a motion is determined.
+        """
+        references = super()._references(i, T_cw)
+        yield next(references)
+        if self._surely == i - 1 and self.state[i - 1] in (TRACKED, ON_SHAPE):
+            self._lm_of_previous = self._add_key_frame(i - 1, self._previous, self.pose_of(i - 1), self._lm_of_previous)
+            yield int(self.ref_kf[i - 1])
+        yield from references
+
     def _start_segment(self, i: int, frame: FrameFeatures) -> np.ndarray:
         """Make frame `i` the first key frame of a new segment if it sees enough with depth."""
         nothing = np.full(len(frame), -1, dtype=np.int32)
         n_depth = int(np.isfinite(frame.depth).sum())
-        if n_depth < self.settings.start_features:
+        if n_depth < self.settings.start_features and not self.shape.fixes_all(i):
             if self.segment < 0:
                 self.lost_reason[i] = f"no map yet: {len(frame)} features, {n_depth} with depth, {self.settings.start_features} wanted"
             return nothing
@@ -93,16 +114,26 @@ class Tracker(Localiser):
     def _wants_key_frame(self, i: int, frame: FrameFeatures, lm_of: np.ndarray) -> bool:
         """Decide as ORB-SLAM2 does: too little of the reference key frame is left in view, or much new surface is near."""
         has_depth = np.isfinite(frame.depth)
+        tracked = lm_of >= 0
+        if self.state[i] == ON_SHAPE:
+            return self._leaves_shape(i)
         if has_depth.sum() < self.settings.min_inliers:
             return False
         kf = self.ref_kf[i]
-        tracked = lm_of >= 0
         seen = self.builder.landmarks_of(kf)
         n_reference = np.count_nonzero(self.builder.lm.n_obs[seen] >= min(2, np.count_nonzero(self.builder.kf.segment == self.segment)))
         leaves_reference = tracked.sum() < self.settings.key_frame_share * n_reference
         meets_new_surface = (tracked & has_depth).sum() < 100 and (~tracked & has_depth).sum() > 70
         is_overdue = i - self.builder.kf.frame[-1] >= self.settings.key_frame_gap
         return bool(meets_new_surface or ((leaves_reference or is_overdue) and not self._is_crowded(i)))
+
+    def _leaves_shape(self, i: int) -> bool:
+        """Say whether frame `i` shows too little of the key frame that it was aligned with, or sees it from elsewhere."""
+        if self._surely < i:
+            return False  # what rests on it would share its error
+        motion = se3.log(self.T_kc[i])
+        is_far = np.linalg.norm(motion[:3]) > SHAPE_M or np.linalg.norm(motion[3:]) > SHAPE_RAD
+        return bool(is_far or self._placement.alignment.overlap < self.settings.key_frame_share)
 
     def _is_crowded(self, i: int) -> bool:
         """Say whether so many key frames stand where frame `i` does that another would only make the map, and every later frame, dearer."""
@@ -121,7 +152,9 @@ class Tracker(Localiser):
         x_w = se3.transform(T_wc, self.camera.backproject(frame.xy[new], frame.depth[new]))
         added = builder.add_landmarks(kf, frame.first_row + new, x_w)
         self.places.add(kf, *word_vector(self.words, i))
-        self.ref_kf[i], self.T_kc[i], self.state[i] = kf, np.eye(4), KEY_FRAME
+        if self.state[i] == ON_SHAPE:
+            self.shape.join(kf)
+        self.ref_kf[i], self.T_kc[i], self.state[i], self._latest, self._surely = kf, np.eye(4), KEY_FRAME, i, i
         self._cull(kf)
         self._recent = np.concatenate([self._recent, added])
         self._share_with_neighbours(kf, added)
@@ -148,7 +181,7 @@ class Tracker(Localiser):
 
     def _adjust_window(self, kf: int) -> None:
         neighbours, shared = self.builder.covisible(kf)
-        window = neighbours[shared >= 15][: self.settings.window_key_frames - 1]
+        window = np.union1d(neighbours[shared >= 15][: self.settings.window_key_frames - 1], self.builder.joined_by_edges(np.array([kf])))
         if len(window) == 0:
             return
         adjustment.adjust(

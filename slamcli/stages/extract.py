@@ -12,8 +12,9 @@ from slamcli.config import ExtractConfig
 from slamcli.datasets import Dataset
 from slamcli.errors import BadFrame, SlamError
 from slamcli.geometry.camera import Camera
+from slamcli.mapping import surface
 from slamcli.parallel import ordered_map
-from slamcli.schema import Features
+from slamcli.schema import CoarseDepth, Features
 from slamcli.vision import orb
 
 
@@ -23,7 +24,7 @@ class _Frame:
 
     points: orb.KeyPoints
     depth: np.ndarray  # (N,) float32 [m]
-    has_depth: bool
+    coarse: np.ndarray | None  # (V, U) uint16, None where there is no depth
     faults: list[str]  # why an image could not be used
 
 
@@ -36,11 +37,15 @@ def run(inputs, out: Path, cfg, tools) -> dict:
         for fault in frame.faults:
             tools.warn(f"frame {i} skipped: {fault}" if len(frame.points) == 0 else f"frame {i} has no depth: {fault}")
     if not any(len(frame.points) for frame in found):
-        raise SlamError(
+        blank = (
             f"{dataset.root}: no feature in any of the {len(dataset)} colour frames: are they blank? try: slamcli inspect {dataset.root}"
         )
+        if not any(frame.coarse is not None and frame.coarse.any() for frame in found):
+            raise SlamError(blank)
+        tools.warn(f"{blank}; the camera can be tracked by the shape alone that depth shows")
     features = _table(dataset, camera, found, cfg.extract.scale)
     artifacts.save(features, out)
+    artifacts.save(_coarse_table(camera, found), out)
     _write_association(out / "frames.txt", dataset, features.depth_stamp)
     write_camera(out, camera)
     n = np.diff(features.offset)
@@ -48,7 +53,7 @@ def run(inputs, out: Path, cfg, tools) -> dict:
         "frames": len(dataset),
         "features": int(n.sum()),
         "features_per_frame": [int(n.min()), float(np.median(n)), int(n.max())],
-        "with_depth": float(np.isfinite(features.depth).mean()),
+        "with_depth": float(np.isfinite(features.depth).mean()) if len(features.depth) else 0.0,
         "frames_without_depth": int(np.isnan(features.depth_stamp).sum()),
         "bad_images": sum(len(frame.faults) for frame in found),
     }
@@ -60,7 +65,7 @@ def _extract(dataset: Dataset, settings: ExtractConfig, i: int) -> _Frame:
     try:
         grey = dataset.grey(i)
     except BadFrame as error:
-        return _Frame(orb.no_key_points(), np.zeros(0, np.float32), has_depth=False, faults=[str(error)])
+        return _Frame(orb.no_key_points(), np.zeros(0, np.float32), coarse=None, faults=[str(error)])
     points = detect(grey, settings)
     try:
         depth = dataset.depth(i)
@@ -68,8 +73,8 @@ def _extract(dataset: Dataset, settings: ExtractConfig, i: int) -> _Frame:
         depth = None
         faults.append(str(error))
     if depth is None:
-        return _Frame(points, np.full(len(points), np.nan, np.float32), has_depth=False, faults=faults)
-    return _Frame(points, depth_at(depth, points.xy, window=settings.depth_window), has_depth=True, faults=faults)
+        return _Frame(points, np.full(len(points), np.nan, np.float32), coarse=None, faults=faults)
+    return _Frame(points, depth_at(depth, points.xy, window=settings.depth_window), surface.coarse(depth), faults)
 
 
 def detect(grey: np.ndarray, settings: ExtractConfig) -> orb.KeyPoints:
@@ -115,7 +120,7 @@ def _table(dataset: Dataset, camera: Camera, found: list[_Frame], scale: float) 
     raw = np.concatenate([p.xy for p in points])
     return Features(
         stamp=np.asarray(dataset.stamp, dtype=np.float64),
-        depth_stamp=np.where([frame.has_depth for frame in found], dataset.depth_stamp, np.nan),
+        depth_stamp=np.where([frame.coarse is not None for frame in found], dataset.depth_stamp, np.nan),
         offset=np.cumsum([0] + [len(p) for p in points], dtype=np.int64),
         xy=camera.undistort(raw).astype(np.float32),
         depth=np.concatenate([frame.depth for frame in found]),
@@ -124,6 +129,14 @@ def _table(dataset: Dataset, camera: Camera, found: list[_Frame], scale: float) 
         desc=np.concatenate([p.desc for p in points]),
         octave_scale=np.float64(scale),
     )
+
+
+def _coarse_table(camera: Camera, found: list[_Frame]) -> CoarseDepth:
+    coarse = np.zeros((len(found), *surface.coarse_shape(camera)), dtype=np.uint16)
+    for i, frame in enumerate(found):
+        if frame.coarse is not None:
+            coarse[i] = frame.coarse
+    return CoarseDepth(coarse_depth=coarse)
 
 
 def _write_association(path: Path, dataset: Dataset, depth_stamp: np.ndarray) -> None:

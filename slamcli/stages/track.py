@@ -8,16 +8,31 @@ import numpy as np
 from slamcli import artifacts
 from slamcli.formats import trajectory as trajectory_file
 from slamcli.mapping import segments
+from slamcli.mapping.shape import Reliefs
 from slamcli.mapping.tracker import Tracker
-from slamcli.schema import LOST, RELOCALISED, Features, Map, Matches, Tracks, Trajectory, Words, frame_segments, trajectory
+from slamcli.schema import (
+    LOST,
+    ON_SHAPE,
+    RELOCALISED,
+    CoarseDepth,
+    Features,
+    Map,
+    Matches,
+    Tracks,
+    Trajectory,
+    Words,
+    frame_segments,
+    trajectory,
+)
 
 
 def run(inputs, out: Path, cfg, tools) -> dict:
     """Track every frame and build the map of key frames and landmarks."""
     features = inputs.load(Features, "extract")
     tracker = Tracker(
-        features, inputs.load(Words, "match"), inputs.load(Matches, "match"), inputs.camera(), cfg.track, cfg.sensor, tools.rng()
-    )
+        features, inputs.load(Words, "match"), inputs.load(Matches, "match"), inputs.camera(), cfg.track, cfg.sensor, tools.rng(),
+        reliefs=Reliefs(inputs.load(CoarseDepth, "extract"), inputs.camera(), cfg.sensor),
+    )  # fmt: skip
     for i in tools.progress(range(len(features.stamp)), "track"):
         tracker.process(i)
     tracks = tracker.tracks()
@@ -32,9 +47,11 @@ def run(inputs, out: Path, cfg, tools) -> dict:
         "tracked": int((tracks.state != LOST).sum()),
         "lost": int((tracks.state == LOST).sum()),
         "relocalised": int((tracks.state == RELOCALISED).sum()),
+        "on_shape": int((tracks.state == ON_SHAPE).sum()),
         "segments": segments.n_segments(map_),
         "key_frames": len(map_.kf_frame),
         "landmarks": len(map_.lm_xyz),
+        "edges": len(map_.edge_kf),
         "lost_spans": [list(span) for span in lost],
     }
 
