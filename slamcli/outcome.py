@@ -31,7 +31,11 @@ def outcome(run: RunDir) -> str:
 
 def _trajectory(records: dict[str, Any]) -> list[str]:
     n_frames, loop = records["extract"]["summary"]["frames"], records["loop"]["summary"]
-    return ["trajectory", f"{n_frames - loop['lost']} of {n_frames} frames, {loop['closures']} loops closed", "loop/trajectory.txt"]
+    return [
+        "trajectory",
+        f"{n_frames - loop['lost']} of {n_frames} frames, {loop['closures']} loop{'s' * (loop['closures'] != 1)} closed",
+        "loop/trajectory.txt",
+    ]
 
 
 def _cost(records: dict[str, Any]) -> list[str]:
