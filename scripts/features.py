@@ -37,7 +37,7 @@ CHANCE = (8.0, 16.0)  # [px] by which points are moved to tell how often one is 
 REVISIT_AFTER = 5.0  # [s] a place seen again sooner is not a loop
 KEY_FRAME_SHARED, SAME_PLACE, OTHER_PLACE = 0.8, 0.5, 0.1  # shared view: less makes a key frame; more is the same place; less is another
 ROUNDS = 7  # the fastest counts: other processes only ever add time
-SHORT_ROUNDS, SHORT = 60, 12  # for wall time: the fewer images in a round, the likelier no other process ran meanwhile
+WALL_ROUNDS = 20  # of wall time, which needs both cores free at once
 
 Detector = Callable[[np.ndarray], orb.KeyPoints]
 
@@ -64,9 +64,8 @@ def rate(detect: Detector, images: list[np.ndarray], workers: int) -> float:
 def threads(detect: Detector, images: list[np.ndarray]) -> dict[str, float]:
     """Give the images per second of one worker and of two, and of a worker in each of two processes; the best of rounds taken in turn."""
     one, two, apart = 0.0, 0.0, 0.0
-    images = images[:: max(len(images) // SHORT, 1)]
     with ProcessPoolExecutor(2, mp_context=get_context("fork")) as pool:
-        for _ in range(SHORT_ROUNDS):
+        for _ in range(WALL_ROUNDS):
             one, two = max(one, rate(detect, images, 1)), max(two, rate(detect, images, 2))
             apart = max(apart, sum(pool.map(rate, (detect, detect), (images, images), (1, 1))))
     return {"frames/s with 1": one, "with 2": two, "factor": two / one, "two processes": apart / one}

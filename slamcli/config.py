@@ -47,12 +47,32 @@ class ExtractConfig:
     """Spread-out ORB features."""
 
     features: int = option(1000, "key points wanted per frame", ge=50, le=20000)
-    levels: int = option(8, "pyramid levels", ge=1, le=12)
+    levels: int = option(
+        8,
+        "pyramid levels; 4 to 10 change the number of correct matches between near frames by 4 % at most",
+        ge=1,
+        le=12,
+    )
     scale: float = option(1.2, "scale between pyramid levels", gt=1.0, le=2.0)
-    cell: int = option(30, "cell side for FAST [px]", ge=8, le=200)
+    cell: int = option(
+        30,
+        "cell side for FAST [px of the level]; 60: 9 % more repeatable, but 13 to 21 % fewer places of the image with a feature, and APE 5 to 10 % higher",
+        ge=8,
+        le=200,
+    )
     smooth: bool = option(True, "seek corners in a copy blurred by 1 px, against sensor noise: 10 to 20 % more correct matches")
-    fast_threshold: int = option(8, "FAST threshold, of the blurred copy if there is one [grey levels]", ge=1, le=255)
-    fast_threshold_low: int = option(5, "threshold where a cell stays empty [grey levels]", ge=1, le=255)
+    fast_threshold: int = option(
+        8,
+        "FAST threshold [grey levels], of the blurred copy if there is one; 20: 12 % fewer features and 13 % fewer correct matches where texture is poor",
+        ge=1,
+        le=255,
+    )
+    fast_threshold_low: int = option(
+        5,
+        "threshold where a cell stays empty [grey levels]; 3: 1 to 5 % less repeatable; 8: 1 to 4 % more, but 4 to 9 % fewer places with a feature",
+        ge=1,
+        le=255,
+    )
     pool: float = option(
         1.3,
         "strongest corners kept for each key point wanted, before they are spread; 0 = all: evener, 10 % fewer correct matches",
@@ -68,7 +88,9 @@ class ExtractConfig:
         True,
         "place key points at the summit of the FAST score instead of at whole pixels of their level: 0.37 instead of 0.84 px median error in a simulated room",
     )
-    depth_window: int = option(1, "depth is the nearest pixel's, or the median of 3 x 3 or 5 x 5 [px]", choices=(1, 3, 5))
+    depth_window: int = option(
+        1, "depth is the nearest pixel's, or the median of 3 x 3 or 5 x 5 [px]; 3: APE the same within 2 %", choices=(1, 3, 5)
+    )
 
 
 @dataclass(frozen=True)
@@ -81,8 +103,15 @@ class MatchConfig:
         choices=("words", "brute"),
     )
     vocabulary: str = option("", "vocabulary file; empty = the shipped one", is_file=True)
-    node_level: int = option(1, "levels below the root at which features are compared under the same node", ge=0, le=12)
-    node_margin: int = option(4, "a feature also counts under a second node that is at most this much farther [bits]", ge=-1, le=256)
+    node_level: int = option(
+        1, "levels below the root at which features are compared under the same node; 2: 14 % fewer correct matches", ge=0, le=12
+    )
+    node_margin: int = option(
+        4,
+        "a feature also counts under a second node that is at most this much farther [bits]; -1 = never: 10 % fewer correct matches in 0.7 to 0.8 of the time; 8: 2 % more in 1.2 times",
+        ge=-1,
+        le=256,
+    )
     window: int = option(1, "frames before it that each frame is matched to", ge=1, le=30)
     max_distance: int = option(64, "descriptors farther apart are no match [bits]", ge=0, le=256)
     ratio: float = option(0.8, "the nearest must be closer than this share of the second nearest's distance", gt=0, le=1)

@@ -27,7 +27,7 @@ def canvas_of(*images: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     box = np.array([(sum(height[:k]), *image.shape) for k, image in enumerate(images)], dtype=np.int64)
     canvas = stale(np.empty((sum(height), -(-max(image.shape[1] for image in images) // 8) * 8), np.uint8))
     for k, image in enumerate(images):
-        pyramid.level(canvas, box, k)[:] = image
+        pyramid.levels(canvas, box)[k][:] = image
     return canvas, box
 
 
@@ -40,7 +40,7 @@ def apply(blur, image: np.ndarray) -> np.ndarray:
     canvas, box = canvas_of(image)
     out = stale(np.empty_like(canvas))
     blur(canvas, box, out)
-    return pyramid.level(out, box, 0)
+    return pyramid.levels(out, box)[0]
 
 
 def score_of(image: np.ndarray, margin: int = fast.RADIUS) -> np.ndarray:
@@ -48,7 +48,7 @@ def score_of(image: np.ndarray, margin: int = fast.RADIUS) -> np.ndarray:
     canvas, box = canvas_of(image)
     out = np.zeros_like(canvas)
     fast.corner_score(canvas, box, margin, out)
-    return pyramid.level(out, box, 0)
+    return pyramid.levels(out, box)[0]
 
 
 def corners_of(image: np.ndarray, *, border: int = 19, at_most: int = 0, **options) -> fast.Corners:
@@ -74,7 +74,7 @@ def test_levels_on_one_canvas_do_not_touch_each_other(seed: int, bounded: bool, 
         blur(canvas, box, out)
         for k, image in enumerate(images):
             inner = (slice(edge, image.shape[0] - edge), slice(edge, image.shape[1] - edge))
-            np.testing.assert_array_equal(pyramid.level(out, box, k)[inner], apply(blur, image)[inner])
+            np.testing.assert_array_equal(pyramid.levels(out, box)[k][inner], apply(blur, image)[inner])
     options = {"cell": 13, "threshold": 20, "threshold_low": 5, "rank_by": rank_by}
     at_most, wanted = (20, 3, 9) if bounded else (0, 0, 0), [5, 0, 11]
     together = fast.Finder(box, border=19).corners(canvas, at_most=np.array(at_most), **options)
@@ -303,8 +303,8 @@ def test_descriptors_and_orientations_are_opencvs_on_every_level() -> None:
             points.append(cv2.KeyPoint(float(x) * 1.2**octave, float(y) * 1.2**octave, 31.0, 0.0, 1.0, octave))
     box = pyramid.boxes(240, 320, levels=8, scale=1.2, least=1)
     canvas = pyramid.canvas(box)
-    pyramid.fill(canvas, box, grey)
-    images = [np.ascontiguousarray(pyramid.level(canvas, box, octave)) for octave in range(8)]
+    pyramid.fill(pyramid.levels(canvas, box), grey)
+    images = [np.ascontiguousarray(pyramid.levels(canvas, box)[octave]) for octave in range(8)]
     ours = []
     for point in points:
         xy = np.rint(np.array([point.pt]) / 1.2**point.octave).astype(np.int32)

@@ -81,11 +81,11 @@ def test_a_levels_pixels_map_back_without_a_shift(octave: int) -> None:
     grey = (255 * np.exp(-((u - 300.4) ** 2 + (v - 210.7) ** 2) / 200)).astype(np.uint8)
     box = pyramid.boxes(480, 640, levels=8, scale=1.2, least=1)
     canvas = pyramid.canvas(box)
-    pyramid.fill(canvas, box, grey)
-    image, top = pyramid.level(canvas, box, octave).astype(np.float64), box[octave, pyramid.TOP]
+    pyramid.fill(pyramid.levels(canvas, box), grey)
+    image, top = pyramid.levels(canvas, box)[octave].astype(np.float64), box[octave, pyramid.TOP]
     y, x = np.mgrid[0 : image.shape[0], 0 : image.shape[1]]
     centre = np.array([[(image * x).sum(), (image * (y + top)).sum()]]) / image.sum()
-    np.testing.assert_allclose(pyramid.full_size(centre, np.array([octave], np.uint8), box), [[300.4, 210.7]], atol=0.05)
+    np.testing.assert_allclose(pyramid.FullSize(box)(centre, np.array([octave], np.uint8)), [[300.4, 210.7]], atol=0.05)
 
 
 @settings(max_examples=20, deadline=None)

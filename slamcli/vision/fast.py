@@ -262,8 +262,8 @@ class Finder:
     def __init__(self, box: np.ndarray, *, border: int) -> None:
         """Reserve memory. box : (levels, 3) int64, sides greater than 2 border; border [px] : kept free, >= 6."""
         self.box, self.border = box, border
-        inside = box[:, [HEIGHT, WIDTH]] - 2 * border
-        room = int(((inside + 1) // 2).prod(axis=1).sum())  # no two peaks touch
+        self._inside = (box[:, [HEIGHT, WIDTH]] - 2 * border).tolist()
+        room = sum((height + 1) // 2 * ((width + 1) // 2) for height, width in self._inside)  # no two peaks touch
         self._score = canvas(box)
         self._row = np.empty(self._score.shape[1], dtype=np.uint8)
         self._xy, self._strength, self._cell_of = np.empty((room, 2), np.int32), np.empty(room, np.uint8), np.empty(room, np.int32)
@@ -281,8 +281,7 @@ class Finder:
         rank_by : "sum" for the response of [Z] (1), "fast" for the FAST score
         """
         corner_score(image, self.box, self.border - FIT_RADIUS, self._score)
-        inside = self.box[:, [HEIGHT, WIDTH]] - 2 * self.border
-        best = np.zeros(int((-(-inside // cell)).prod(axis=1).sum()), dtype=np.uint8)
+        best = np.zeros(sum(-(-height // cell) * -(-width // cell) for height, width in self._inside), dtype=np.uint8)
         histogram, first = np.zeros((len(self.box), 256), dtype=np.int32), np.empty(len(self.box) + 1, dtype=np.int64)
         found = self._xy, self._strength, self._cell_of, best
         low = np.uint8(min(threshold, threshold_low))

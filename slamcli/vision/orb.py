@@ -57,25 +57,24 @@ def detect(
     box = space.box
     if len(box) == 0:
         return no_key_points()
-    pyramid.fill(space.image, box, grey)
+    pyramid.fill(space.levels, grey)
     if smooth:
         filters.blur_1px(space.image, box, space.blurred)
-    areas = [(height - 2 * brief.BORDER) * (width - 2 * brief.BORDER) for _, height, width in box.tolist()]
     corners = space.finder.corners(
         space.blurred if smooth else space.image,
         cell=cell,
         threshold=threshold,
         threshold_low=threshold_low,
-        at_most=np.array([max(round(pool * features * area / sum(areas)), 1) if pool else 0 for area in areas]),
+        at_most=np.array([max(round(pool * features * area / space.area), 1) if pool else 0 for area in space.areas]),
         rank_by=rank_by,
     )
-    wanted = shares(features, areas, np.diff(corners.first).tolist())
+    wanted = shares(features, space.areas, np.diff(corners.first).tolist())
     rows, octave = quadtree.choose(corners.xy, corners.response, corners.first, space.roots, wanted)
     xy = corners.xy.take(rows, axis=0)
     angle = brief.orientation(space.image, xy)
     filters.blur_2px(space.image, box, space.blurred)
     return KeyPoints(
-        xy=pyramid.full_size(corners.summits(rows) if subpixel else xy.astype(np.float64), octave, box),
+        xy=space.full_size(corners.summits(rows) if subpixel else xy.astype(np.float64), octave),
         octave=octave,
         angle=angle,
         response=corners.response.take(rows),
@@ -117,8 +116,11 @@ class _Space:
         self.box = box
         if len(box):
             self.image, self.blurred = pyramid.canvas(box), pyramid.canvas(box)
-            self.finder = fast.Finder(box, border=brief.BORDER)
+            self.levels = pyramid.levels(self.image, box)
+            self.finder, self.full_size = fast.Finder(box, border=brief.BORDER), pyramid.FullSize(box)
             top, height, width = box.T
+            self.areas = ((height - 2 * brief.BORDER) * (width - 2 * brief.BORDER)).tolist()
+            self.area = sum(self.areas)
             sides = [np.full(len(box), brief.BORDER), top + brief.BORDER, width - brief.BORDER, top + height - brief.BORDER]
             self.roots = np.stack(sides, axis=1).astype(np.int32)
 

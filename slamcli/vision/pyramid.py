@@ -1,5 +1,7 @@
 """The image pyramid, all levels on one canvas: each step of extraction is one call of a kernel for the whole image, not one for each level."""
 
+from itertools import pairwise
+
 import cv2
 import numpy as np
 
@@ -27,30 +29,34 @@ def canvas(box: np.ndarray) -> np.ndarray:
     return np.empty((box[-1, TOP] + box[-1, HEIGHT], -(-box[:, WIDTH].max() // ALIGNMENT) * ALIGNMENT), dtype=np.uint8)
 
 
-def level(image: np.ndarray, box: np.ndarray, octave: int) -> np.ndarray:
-    """Give one level of a canvas, a view."""
-    top, height, width = box[octave].tolist()
-    return image[top : top + height, :width]
+def levels(image: np.ndarray, box: np.ndarray) -> list[np.ndarray]:
+    """Give the levels of a canvas, views."""
+    return [image[top : top + height, :width] for top, height, width in box.tolist()]
 
 
-def fill(image: np.ndarray, box: np.ndarray, grey: np.ndarray) -> None:
-    """Write the pyramid of a grey image onto a canvas, each level made from the one before."""
-    level(image, box, 0)[:] = grey
-    for octave in range(1, len(box)):
-        smaller = level(image, box, octave)
-        cv2.resize(level(image, box, octave - 1), smaller.shape[::-1], dst=smaller, interpolation=cv2.INTER_LINEAR_EXACT)
+def fill(images: list[np.ndarray], grey: np.ndarray) -> None:
+    """Write the pyramid of a grey image into the levels of a canvas, each made from the one before."""
+    images[0][:] = grey
+    for larger, smaller in pairwise(images):
+        cv2.resize(larger, smaller.shape[::-1], dst=smaller, interpolation=cv2.INTER_LINEAR_EXACT)
 
 
-def full_size(place: np.ndarray, octave: np.ndarray, box: np.ndarray) -> np.ndarray:
-    """Map places (N, 2) float64 [px] of levels octave (N,) uint8 from the canvas to the full-size image, (N, 2) float32.
+class FullSize:
+    """Maps places on a canvas to the full-size image.
 
     Resizing keeps the outer edges of the corner pixels in place, not their centres: leaving the half pixel out, as cv2.ORB does, would
     shift the points of level 7 by 1.3 px against those of level 0.
     """
-    first, ratio = np.zeros((len(box), 2)), box[0, [WIDTH, HEIGHT]] / box[:, [WIDTH, HEIGHT]]
-    first[:, 1] = box[:, TOP]
-    out = place - first.take(octave, axis=0)  # take: the index in brackets is six times slower
-    out += 0.5
-    out *= ratio.take(octave, axis=0)
-    out -= 0.5
-    return out.astype(np.float32)
+
+    def __init__(self, box: np.ndarray) -> None:
+        """Take the boxes of the levels, (levels, 3) int64."""
+        self._first, self._ratio = np.zeros((len(box), 2)), box[:1, [WIDTH, HEIGHT]] / box[:, [WIDTH, HEIGHT]]
+        self._first[:, 1] = box[:, TOP]
+
+    def __call__(self, place: np.ndarray, octave: np.ndarray) -> np.ndarray:
+        """Give the pixels (N, 2) float32 of places (N, 2) float64 [px] of levels octave (N,) uint8."""
+        out = place - self._first.take(octave, axis=0)  # take: the index in brackets is six times slower
+        out += 0.5
+        out *= self._ratio.take(octave, axis=0)
+        out -= 0.5
+        return out.astype(np.float32)
