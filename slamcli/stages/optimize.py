@@ -8,9 +8,13 @@ import numpy as np
 from slamcli import artifacts
 from slamcli.geometry.camera import Camera
 from slamcli.mapping import adjustment, hindsight, selfcalibration, timing
+from slamcli.mapping.localiser import NO_RELIEFS
 from slamcli.mapping.mapbuilder import MapBuilder
-from slamcli.schema import Features, Map, Timing, Tracks
+from slamcli.mapping.shape import Reliefs, Shape
+from slamcli.schema import CoarseDepth, Features, Map, Timing, Tracks
 from slamcli.stages.track import save_map_stage
+
+SHARED = 30  # landmarks of two key frames whose depth images are aligned too
 
 
 def run(inputs, out: Path, cfg, tools) -> dict:
@@ -21,7 +25,8 @@ def run(inputs, out: Path, cfg, tools) -> dict:
     when, sigma, summary = still, np.full(2, np.nan), {}
     if cfg.optimize.enabled and len(map_.kf_frame) > 1:
         builder = MapBuilder.from_map(features, map_)
-        tracks, when, sigma, summary = refine(builder, features, tracks, still, camera, cfg, tools)
+        reliefs = Reliefs(inputs.load(CoarseDepth, "extract"), camera, cfg.sensor)
+        tracks, when, sigma, summary = refine(builder, features, tracks, still, camera, cfg, tools, reliefs=reliefs)
         map_ = builder.snapshot()
     save_map_stage(out, features.stamp, tracks, map_)
     artifacts.save(tracks, out)
@@ -35,7 +40,7 @@ def run(inputs, out: Path, cfg, tools) -> dict:
 
 
 def refine(
-    builder: MapBuilder, features: Features, tracks: Tracks, when: Timing, camera: Camera, cfg, tools
+    builder: MapBuilder, features: Features, tracks: Tracks, when: Timing, camera: Camera, cfg, tools, *, reliefs: Reliefs = NO_RELIEFS
 ) -> tuple[Tracks, Timing, np.ndarray, dict]:
     """Adjust the map, find the timing that suits it, and again; returns tracks, timing, its standard deviations (2,) [s], the evidence.
 
@@ -54,6 +59,9 @@ def refine(
         when = replace(when, twist=timing.frame_twists(features.stamp, tracks, builder.snapshot()))
         cost.append(result.cost[-1])
     builder.features = timing.rectify(features, when, camera)
+    if cfg.optimize.shape_edges:
+        T_cd = timing.depth_to_colour(features, when, builder.kf.frame)
+        Shape(builder, reliefs, reliefs).join_covisible(T_cd, most=cfg.optimize.shape_edges, least=SHARED)
     result = adjustment.adjust(builder, kfs, camera, cfg.sensor, max_iterations=cfg.optimize.iterations)
     tracks = hindsight.refine_frames(builder, builder.features, tracks, camera, cfg.sensor, cfg.track, tools.progress)
     summary = {} if result is None else {"cost": [*cost, result.cost[-1]], "outliers": int((~result.is_inlier).sum())}
