@@ -145,3 +145,15 @@ def test_key_frames_are_joined_only_where_they_show_the_same():
     assert np.linalg.norm(e) < 0.006
     builder.kf.T_wk[2] = se3.exp([2.0, 0.0, 0.0, 0.0, 0.0, 0.0]) @ builder.kf.T_wk[2]
     assert not shape.join_pair(2, 0) and shape.join(2) == 0 and len(builder.edge) == 1
+
+
+def test_edges_hold_for_the_instants_of_the_colour_images():
+    """The depth cameras stand where they stand; the key frames, elsewhere on the way."""
+    T_wd, T_cd = turn(14), se3.exp(np.array([[0.01, -0.02, 0.03, 0.02, -0.03, 0.01], [-0.02, 0.01, 0.0, 0.0, 0.03, 0.02]]))
+    builder = MapBuilder(blind(14)[0])
+    for kf, frame in enumerate((0, 2)):
+        builder.add_key_frame(frame, T_wd[frame] @ se3.inverse(T_cd[kf]))
+    reliefs = Reliefs(corner(), KINECT, SENSOR)
+    assert Shape(builder, reliefs, reliefs).join_pair(1, 0, T_cd)
+    e = se3.log(builder.edge.T_ij[0] @ se3.inverse(builder.kf.T_wk[0]) @ builder.kf.T_wk[1])
+    assert np.linalg.norm(e) < 0.006
