@@ -156,6 +156,9 @@ class OptimizeConfig:
 
     enabled: bool = option(True, "false: the map passes through")
     iterations: int = option(30, "rounds of global bundle adjustment at most", ge=1)
+    shape_edges: int = option(
+        0, "earlier key frames that each one's depth image is aligned with, besides the landmarks that both see; 0 = none", ge=0, le=50
+    )
     move_depth: bool = option(True, "move depth readings to the colour image's time with the camera's own motion, by what the stamps say")
     readout: bool = option(
         True, "find how long the camera takes to read a colour image, and take the rolling shutter out of the measurements"

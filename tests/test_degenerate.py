@@ -40,16 +40,28 @@ BLANK = pytest.mark.parametrize("value", [0, 255, 90], ids=["black", "over-expos
 @BLANK
 def test_nothing_but_blank_frames_is_refused_in_one_line(short: Path, slamcli: Slamcli, value: int) -> None:
     faults.repaint(short, "rgb", blank(value))
+    faults.repaint(short, "depth", blank(0))
     result, _ = run(slamcli, short)
     assert result.exit_code == 1
-    assert len(result.stderr.strip().splitlines()) == 1
-    assert "no feature" in result.stderr
-    assert "slamcli inspect" in result.stderr
+    error = [line for line in result.stderr.splitlines() if not line.startswith("Warning")]
+    assert len(error) == 1
+    assert "no feature" in error[0]
+    assert "slamcli inspect" in error[0]
+
+
+def test_blank_frames_with_depth_are_mapped_by_shape_or_lost_with_the_reason(short: Path, slamcli: Slamcli) -> None:
+    faults.repaint(short, "rgb", blank(0))
+    result, states = run(slamcli, short)
+    assert result.exit_code == 0, result.output
+    assert set(states.values()) == {"up to date"}
+    assert "by the shape alone" in result.stderr and "Traceback" not in result.output
+    assert n_poses(short) == FRAMES or "lost" in result.stderr
 
 
 @BLANK
 def test_blank_frames_on_the_way_are_lost_and_the_rest_is_mapped(short: Path, slamcli: Slamcli, value: int) -> None:
     faults.repaint(short, "rgb", blank(value), slice(FRAMES // 2, None))
+    faults.repaint(short, "depth", blank(0), slice(FRAMES // 2, None))
     result, states = run(slamcli, short)
     assert result.exit_code == 0, result.output
     assert set(states.values()) == {"up to date"}

@@ -1,9 +1,12 @@
+from types import SimpleNamespace
+
 import numpy as np
 from scenes import CAMERA, observe, room_points, sweep
 
 from slamcli.geometry import se3
 from slamcli.mapping import timing
 from slamcli.mapping.timing import depth_poses
+from slamcli.schema import Timing
 
 RATE = np.array([0.3, -0.2, 0.1, 0.2, 0.4, -0.1])  # twist a second
 
@@ -45,3 +48,13 @@ def test_features_are_rectified_the_same_in_small_portions(monkeypatch):
     again = timing.rectify(scene.features, when, CAMERA)
     np.testing.assert_array_equal(again.xy, whole.xy)
     np.testing.assert_array_equal(again.depth, whole.depth)
+
+
+def test_depth_is_moved_to_where_colour_was_taken():
+    stamp = np.arange(5) / 30.0
+    twist = np.tile([0.3, 0.0, 0.1, 0.0, 0.5, 0.0], (5, 1))
+    features = SimpleNamespace(stamp=stamp, depth_stamp=np.append(stamp[:4] + 0.01, np.nan))
+    when = Timing(readout=np.array(0.0), depth_delay=np.array(-0.03), twist=twist)
+    T_cd = timing.depth_to_colour(features, when, np.array([1, 4]))
+    np.testing.assert_allclose(T_cd[0], se3.exp(-0.02 * twist[0]), atol=1e-12)
+    np.testing.assert_allclose(T_cd[1], np.eye(4), atol=1e-12)

@@ -148,16 +148,30 @@ class Shape:
                 break
         return n
 
-    def join_pair(self, kf_i: int, kf_j: int) -> bool:
+    def join_covisible(self, T_cd: np.ndarray, *, most: int, least: int) -> int:
+        """Add edges between each key frame and up to `most` earlier ones that share at least `least` landmarks; returns how many.
+
+        T_cd : (K, 4, 4) each key frame's camera when its depth was measured, to its camera when colour was
+        """
+        n = 0
+        for kf in range(1, len(self._builder.kf)):
+            neighbours, shared = self._builder.covisible(kf)
+            for other in neighbours[(neighbours < kf) & (shared >= least)][:most]:
+                n += self.join_pair(kf, int(other), T_cd)
+        return n
+
+    def join_pair(self, kf_i: int, kf_j: int, T_cd: np.ndarray | None = None) -> bool:
         """Add an edge between two key frames if their depth images show the same and determine how the two lie."""
         table = self._builder.kf
+        T_i, T_j = (np.eye(4) if T_cd is None else T_cd[kf] for kf in (kf_i, kf_j))
         target, source = (self._map_reliefs.of(int(table.frame[kf])) for kf in (kf_i, kf_j))
         if target is None or source is None:
             return False
-        found = surface.align(se3.inverse(table.T_wk[kf_i]) @ table.T_wk[kf_j], source, target)
+        found = surface.align(se3.inverse(table.T_wk[kf_i] @ T_i) @ table.T_wk[kf_j] @ T_j, source, target)
         if found.agreement < MIN_AGREEMENT or found.overlap < JOIN_OVERLAP or surface.n_determined(found.information, found.depth) < 6:
             return False
-        self._builder.add_edge(kf_i, kf_j, found.T_ij, found.information)
+        to_depth = se3.adjoint(se3.inverse(T_i))
+        self._builder.add_edge(kf_i, kf_j, T_i @ found.T_ij @ se3.inverse(T_j), to_depth.T @ found.information @ to_depth)
         return True
 
     def around(self, T_wc: np.ndarray, segment: int) -> np.ndarray:

@@ -89,6 +89,12 @@ def rectify(features: Features, timing: Timing, camera: Camera) -> Features:
     return replace(features, xy=xy, depth=depth)
 
 
+def depth_to_colour(features: Features, when: Timing, frames: np.ndarray) -> np.ndarray:
+    """Give per frame of `frames` (N,) its camera when depth was measured to its camera when colour was, (N, 4, 4)."""
+    later = features.depth_stamp[frames] + float(when.depth_delay) - features.stamp[frames]
+    return se3.exp(when.twist[frames] * np.nan_to_num(later)[:, None])
+
+
 def depth_poses(stamp: np.ndarray, depth_stamp: np.ndarray, T_wc: np.ndarray) -> np.ndarray:
     """Move each frame's pose to the time of its depth image, along the screw motion to the neighbouring frame.
 

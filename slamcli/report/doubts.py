@@ -6,7 +6,7 @@ import numpy as np
 
 from slamcli.freshness import MISSING
 from slamcli.report.collect import Content
-from slamcli.schema import LOST
+from slamcli.schema import LOST, ON_SHAPE, RELOCALISED, TRACKED
 
 GOOD, NOTE, BAD = "good", "note", "bad"
 FEW_FEATURES = 150  # in a frame
@@ -69,7 +69,10 @@ def _features(content: Content) -> list[Remark]:
     few = int((content.n_features < FEW_FEATURES).sum())
     if few > MANY * n:
         found.append(Remark(BAD, f"{few} of {n} frames have fewer than {FEW_FEATURES} features: too dark, blurred, or bare walls."))
-    weak = int(((content.n_inliers < FEW_INLIERS) & (content.state != LOST)).sum())
+    on_shape = int((content.state == ON_SHAPE).sum())
+    if on_shape:
+        found.append(Remark(NOTE, f"{on_shape} frames were placed by the shape that depth shows, as their pictures show too little."))
+    weak = int(((content.n_inliers < FEW_INLIERS) & np.isin(content.state, (TRACKED, RELOCALISED))).sum())
     if weak > MANY * n:
         found.append(Remark(NOTE, f"The poses of {weak} frames rest on fewer than {FEW_INLIERS} landmarks and may be inaccurate."))
     without = content.summary("extract").get("frames_without_depth", 0)

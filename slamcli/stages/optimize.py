@@ -7,11 +7,15 @@ import numpy as np
 
 from slamcli import artifacts
 from slamcli.mapping import adjustment, hindsight, selfcalibration, timing
+from slamcli.mapping.localiser import NO_RELIEFS
 from slamcli.mapping.mapbuilder import MapBuilder
 from slamcli.mapping.selfcalibration import Sensing
-from slamcli.schema import Features, Map, Timing, Tracks
+from slamcli.mapping.shape import Reliefs, Shape
+from slamcli.schema import CoarseDepth, Features, Map, Timing, Tracks
 from slamcli.stages.extract import write_camera
 from slamcli.stages.track import save_map_stage
+
+SHARED = 30  # landmarks of two key frames whose depth images are aligned too
 
 
 def run(inputs, out: Path, cfg, tools) -> dict:
@@ -23,7 +27,8 @@ def run(inputs, out: Path, cfg, tools) -> dict:
     sensing, summary = Sensing(given, still, {}), {}
     if cfg.optimize.enabled and len(map_.kf_frame) > 1:
         builder = MapBuilder.from_map(features, map_)
-        tracks, sensing, summary = refine(builder, features, tracks, sensing, cfg, tools)
+        reliefs = Reliefs(inputs.load(CoarseDepth, "extract"), given, cfg.sensor)
+        tracks, sensing, summary = refine(builder, features, tracks, sensing, cfg, tools, reliefs=reliefs)
         map_ = builder.snapshot()
     save_map_stage(out, features.stamp, tracks, map_)
     artifacts.save(tracks, out)
@@ -32,7 +37,9 @@ def run(inputs, out: Path, cfg, tools) -> dict:
     return {"frames": len(features.stamp), "key_frames": len(map_.kf_frame)} | told(sensing) | summary
 
 
-def refine(builder: MapBuilder, features: Features, tracks: Tracks, sensing: Sensing, cfg, tools) -> tuple[Tracks, Sensing, dict]:
+def refine(
+    builder: MapBuilder, features: Features, tracks: Tracks, sensing: Sensing, cfg, tools, *, reliefs: Reliefs = NO_RELIEFS
+) -> tuple[Tracks, Sensing, dict]:
     """Adjust the map, find what of the camera suits it, and again; returns tracks, what was found, and the evidence.
 
     sensing : what is known of the camera before. The motion in it comes from poses, the poses from features that it corrected: two
@@ -50,6 +57,9 @@ def refine(builder: MapBuilder, features: Features, tracks: Tracks, sensing: Sen
         sensing = replace(found, timing=replace(found.timing, twist=twist))
         cost.append(result.cost[-1])
     builder.features = selfcalibration.correct(features, given, sensing)
+    if cfg.optimize.shape_edges:
+        T_cd = timing.depth_to_colour(features, sensing.timing, builder.kf.frame)
+        Shape(builder, reliefs, reliefs).join_covisible(T_cd, most=cfg.optimize.shape_edges, least=SHARED)
     result = adjustment.adjust(builder, kfs, sensing.camera, cfg.sensor, max_iterations=cfg.optimize.iterations)
     tracks = hindsight.refine_frames(builder, builder.features, tracks, sensing.camera, cfg.sensor, cfg.track, tools.progress)
     summary = {} if result is None else {"cost": [*cost, result.cost[-1]], "outliers": int((~result.is_inlier).sum())}
