@@ -17,6 +17,8 @@ from slamcli.parallel import ordered_map
 from slamcli.schema import CoarseDepth, Features
 from slamcli.vision import orb
 
+JUMP_REACH = 3  # px to either side of a key point where a jump of depth is looked for: as far as FAST looks
+
 
 @dataclass(frozen=True)
 class _Frame:
@@ -74,7 +76,10 @@ def _extract(dataset: Dataset, settings: ExtractConfig, i: int) -> _Frame:
         faults.append(str(error))
     if depth is None:
         return _Frame(points, np.full(len(points), np.nan, np.float32), coarse=None, faults=faults)
-    return _Frame(points, depth_at(depth, points.xy, window=settings.depth_window), surface.coarse(depth), faults)
+    read = depth_at(depth, points.xy, window=settings.depth_window)
+    if settings.depth_jump:
+        read = np.where(is_at_jump(depth, points.xy, jump=settings.depth_jump), np.float32(np.nan), read)
+    return _Frame(points, read, surface.coarse(depth), faults)
 
 
 def detect(grey: np.ndarray, settings: ExtractConfig) -> orb.KeyPoints:
@@ -108,6 +113,24 @@ def depth_at(depth: np.ndarray, xy: np.ndarray, *, window: int = 1) -> np.ndarra
     readings = np.sort(depth[rows[:, :, None], columns[:, None, :]].reshape(len(xy), window * window), axis=1)  # NaN last
     n = np.isfinite(readings).sum(axis=1)
     return readings[np.arange(len(xy)), np.maximum(n - 1, 0) // 2]
+
+
+def is_at_jump(depth: np.ndarray, xy: np.ndarray, *, jump: float) -> np.ndarray:
+    """Say which raw points xy (N, 2) stand where depth (H, W) [m] jumps by more than the share `jump`, (N,) bool.
+
+    The outline of a thing before another is no fixed point in space, and a pixel more to the side its depth is that of the other.
+    Along a line over a plane, however slanted, the inverse of depth is linear in pixels: where it bends, the surface ends.
+    """
+    column, row = np.rint(xy).astype(np.int64).T
+
+    def inverse(down: int, right: int) -> np.ndarray:
+        rows = np.clip(row + JUMP_REACH * down, 0, depth.shape[0] - 1)
+        return 1.0 / depth[rows, np.clip(column + JUMP_REACH * right, 0, depth.shape[1] - 1)]
+
+    here, found = inverse(0, 0), np.zeros(len(xy), dtype=bool)
+    for down, right in ((0, 1), (1, 0), (1, 1), (1, -1)):
+        found |= np.abs(inverse(down, right) + inverse(-down, -right) - 2.0 * here) > jump * here
+    return found
 
 
 def write_camera(out: Path, camera: Camera) -> None:
