@@ -82,20 +82,17 @@ def _grow(
 @kernel
 def _strongest(
     response: f4[::1],
-    first: i8[::1],
     wanted: i8[::1],
     node: i4[:, ::1],
     n_nodes: i8[::1],
     following: i4[::1],
     is_chosen: u1[::1],
-    chosen: i4[::1],
-    octave: u1[::1],
 ):
     """Choose the strongest point of each leaf, of equals the first; where the last split gave leaves too many, the weakest go.
 
-    response : (N,) float32; is_chosen : (N,) uint8, 0; chosen : (sum of wanted,) int32 and octave : uint8, filled. Returns how many.
+    response : (N,) float32; is_chosen : (N,) uint8, 0, becomes 1
     """
-    base, n = 0, 0
+    base = 0
     for level in range(len(wanted)):
         for v in range(base, base + n_nodes[level]):
             best = node[v, FIRST]
@@ -114,12 +111,7 @@ def _strongest(
                     weakest = v
             is_chosen[node[weakest, FIRST]] = 0
             node[weakest, FIRST] = node[end, FIRST]
-        for k in range(first[level], first[level + 1]):
-            if is_chosen[k]:
-                chosen[n], octave[n] = k, level
-                n += 1
         base += wanted[level] + 3
-    return n
 
 
 def choose(xy: np.ndarray, response: np.ndarray, first: np.ndarray, root: np.ndarray, wanted: list[int]) -> tuple[np.ndarray, np.ndarray]:
@@ -127,11 +119,12 @@ def choose(xy: np.ndarray, response: np.ndarray, first: np.ndarray, root: np.nda
 
     xy : (N, 2) int32 [px], no point twice; response : (N,) float32; first : (levels + 1,) int64, row of each level's first point
     root : (levels, 4) int32, x0, y0, x1, y1 of the first nodes [px], the end excluded
-    Returns increasing rows (M,) int32 of xy and their levels (M,) uint8. Where the last split gave nodes too many, the weakest points go.
+    Returns increasing rows (M,) int64 of xy and their levels (M,) uint8. Where the last split gave nodes too many, the weakest points go.
     """
     goal, room = np.array(wanted, dtype=np.int64), sum(wanted) + 3 * len(wanted)
     node, n_nodes, following = np.empty((room, NODE_COLUMNS), np.int32), np.empty(len(wanted), np.int64), np.empty(len(xy), np.int32)
     _grow(xy, first, root, goal, node, n_nodes, following, np.empty((4, 2), np.int32), np.empty(room, np.int32))
-    is_chosen, chosen, octave = np.zeros(len(xy), np.uint8), np.empty(sum(wanted), np.int32), np.empty(sum(wanted), np.uint8)
-    n = _strongest(response, first, goal, node, n_nodes, following, is_chosen, chosen, octave)
-    return chosen[:n], octave[:n]
+    is_chosen = np.zeros(len(xy), np.uint8)
+    _strongest(response, goal, node, n_nodes, following, is_chosen)
+    rows = np.flatnonzero(is_chosen)
+    return rows, (np.searchsorted(first, rows, side="right") - 1).astype(np.uint8)
