@@ -29,6 +29,7 @@ from slamcli.rundir import RunDir
 
 LEVERS = {  # how each is turned, and what it is
     "extract.subpixel=false": "sub-pixel key points",
+    "extract.depth_jump=0": "no depth for key points where depth jumps",
     "optimize.move_depth=false": "depth moved to the colour image's time",
     "optimize.depth_delay=false": "of that, the delay that the stamps do not show",
     "optimize.readout=false": "rolling shutter",
@@ -108,7 +109,7 @@ def table(pairs: list[dict[str, Any]]) -> str:
 
 def is_on(lever: str) -> bool:
     """Say whether a lever is on by default: whether turning it turns it off."""
-    return lever.endswith("=false")
+    return lever.endswith(("=false", "=0"))
 
 
 def gain_cells(lever: str, pairs: list[dict[str, Any]]) -> list[str]:

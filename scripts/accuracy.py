@@ -1,7 +1,7 @@
 #!/usr/bin/env python
 """Compare two configurations over recordings x start frames x steps x seeds, pair by pair, and ORB-SLAM3 on the same images beside them.
 
-    python scripts/accuracy.py OUT RECORDING... --change optimize.timing=false [--change KEY=VALUE ...]
+    python scripts/accuracy.py OUT RECORDING... --change optimize.readout=false [--change KEY=VALUE ...]
     python scripts/accuracy.py OUT RECORDING... --offsets 0 1 2 --every 1 3 --seeds 0 1
     python scripts/accuracy.py OUT RECORDING... --orbslam3 ORB/bin/python words.txt --rival-runs 3
 

@@ -36,7 +36,7 @@ def test_turning_a_lever_changes_the_default(lever: str) -> None:
     assert changed != Config()
     if ablation.is_on(lever):
         section, option = lever.partition("=")[0].split(".")
-        assert getattr(getattr(Config(), section), option) is True
+        assert getattr(getattr(Config(), section), option)
 
 
 def test_a_gain_is_what_having_the_lever_on_takes_off_the_error() -> None:
