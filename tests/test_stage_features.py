@@ -160,8 +160,13 @@ def test_a_recording_without_any_feature_is_a_clear_error(tmp_path: Path) -> Non
     recording = write_recording(tmp_path / "recording")
     for path in (recording / "rgb").iterdir():
         cv2.imwrite(str(path), np.full_like(cv2.imread(str(path)), 128))
+    features, summary, warnings = run_extract(recording, tmp_path / "extract")
+    assert len(features.xy) == summary["features"] == summary["with_depth"] == 0
+    assert any("no feature in any" in text and "by the shape alone" in text for text in warnings)
+    for path in (recording / "depth").iterdir():
+        cv2.imwrite(str(path), np.zeros_like(cv2.imread(str(path), cv2.IMREAD_UNCHANGED)))
     with pytest.raises(SlamError, match="no feature in any"):
-        run_extract(recording, tmp_path / "extract")
+        run_extract(recording, tmp_path / "again")
 
 
 def test_one_frame_is_enough(tmp_path: Path) -> None:

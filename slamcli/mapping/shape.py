@@ -154,10 +154,11 @@ class Shape:
         T_cd : (K, 4, 4) each key frame's camera when its depth was measured, to its camera when colour was
         """
         n = 0
+        joined = set(map(tuple, self._builder.edge.kf.tolist()))
         for kf in range(1, len(self._builder.kf)):
             neighbours, shared = self._builder.covisible(kf)
-            for other in neighbours[(neighbours < kf) & (shared >= least)][:most]:
-                n += self.join_pair(kf, int(other), T_cd)
+            for other in neighbours[(neighbours < kf) & (shared >= least)][:most].tolist():
+                n += (kf, other) not in joined and self.join_pair(kf, other, T_cd)
         return n
 
     def join_pair(self, kf_i: int, kf_j: int, T_cd: np.ndarray | None = None) -> bool:

@@ -27,7 +27,8 @@ CLEANING = SurfaceConfig(edge=1, window=1.0, max_angle_deg=75.0)
 SCHEDULE = np.array([(8.0, 0.3, 8.0, 1e-3), (4.0, 0.12, 6.0, 5e-4), (1.0, 0.06, 4.0, 2e-4)])
 MIN_COSINE = 0.8  # between the normals of points that meet
 HUBER_CHI2 = 4.0
-# Neighbouring readings err together, by the sensor's correlation window, its steps of disparity and its warp: so many count as one.
+# Readings err together, by the sensor's correlation window, its steps of disparity and its warp: so many count as one. With 500, chi2 of
+# the motion found is 0.3 for a simulated Kinect, whose readings hardly do, and 50 on fr1_xyz: it should be 6.
 READINGS_AS_ONE = 500.0
 # [m, rad] how far the start is believed to be off: next to nothing beside what shape says, and all there is where it says nothing.
 START_SIGMA = np.array([0.2, 0.2, 0.2, 0.2, 0.2, 0.2])

@@ -103,7 +103,8 @@ class Tracker(Localiser):
         n_depth = int(np.isfinite(frame.depth).sum())
         if n_depth < self.settings.start_features and not self.shape.fixes_all(i):
             if self.segment < 0:
-                self.lost_reason[i] = f"no map yet: {len(frame)} features, {n_depth} with depth, {self.settings.start_features} wanted"
+                seen = f"{len(frame)} features, {n_depth} with depth, {self.settings.start_features} wanted"
+                self.lost_reason[i] = f"no map yet: {seen}, and depth shows too little shape to begin with"
             return nothing
         self.segment, self._n_lost = len(np.unique(self.builder.kf.segment)), 0
         self.lost_reason.pop(i, None)
