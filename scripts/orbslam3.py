@@ -100,7 +100,7 @@ def main() -> None:
         found = track(slam, root, lines, arguments.pace)
         slam.shutdown()
         found |= {"cpu_seconds": time.process_time() - cpu, "wall_seconds": time.perf_counter() - wall}
-        if arguments.out:
+        if arguments.out and found["tracked"]:  # it ends the process where there is nothing to write
             slam.save_trajectory_tum(str(arguments.out))
     print(json.dumps(found))
 

@@ -150,28 +150,27 @@ def align(
     readings_as_one : what H and b are divided by, beside the variance factor, against H_known and b_known, known at the start besides
     """
     A, g, total, xi, L = np.empty((6, 6)), np.empty(6), np.zeros(6), np.empty(6), np.empty((6, 6))
-    for s in range(len(schedule)):
-        step = int(schedule[s, 0])
-        for _ in range(int(schedule[s, 2])):
-            _, agree, cost = _normal_equations(
-                T_ij, xyz_j, normal_j, variance_j, row_i, xyz_i, normal_i, variance_i, pinhole, step, schedule[s, 1], min_cosine, limit,
-                False, H, b
-            )  # fmt: skip
-            weight = 1.0 / (readings_as_one * max(cost / max(agree, 1), LEAST_VARIANCE_FACTOR))
-            for i in range(6):
-                g[i] = step * weight * b[i] + b_known[i]
-                for j in range(6):
-                    A[i, j] = step * weight * H[min(i, j), max(i, j)] + H_known[i, j]
-                    g[i] -= H_known[i, j] * total[j]
-            if not solve_damped(A, g, 0.0, L, xi):
-                break
+    s, done = 0, 0
+    while True:  # one call, so that what it calls is compiled into this kernel once
+        is_final = s == len(schedule)
+        step, reach = (1, schedule[s - 1, 1]) if is_final else (int(schedule[s, 0]), schedule[s, 1])
+        met, agree, cost = _normal_equations(
+            T_ij, xyz_j, normal_j, variance_j, row_i, xyz_i, normal_i, variance_i, pinhole, step, reach, min_cosine, limit, is_final, H, b
+        )  # fmt: skip
+        if is_final:
+            return met, agree, cost
+        done += 1
+        weight = step / (readings_as_one * max(cost / max(agree, 1), LEAST_VARIANCE_FACTOR))
+        for i in range(6):
+            g[i] = weight * b[i] + b_known[i]
+            for j in range(6):
+                A[i, j] = weight * H[min(i, j), max(i, j)] + H_known[i, j]
+                g[i] -= H_known[i, j] * total[j]
+        length = 0.0
+        if solve_damped(A, g, 0.0, L, xi):
             left_update(T_ij, xi)
-            length = 0.0
             for i in range(6):
                 total[i] += xi[i]
                 length += xi[i] * xi[i]
-            if length < schedule[s, 3] ** 2:
-                break
-    return _normal_equations(
-        T_ij, xyz_j, normal_j, variance_j, row_i, xyz_i, normal_i, variance_i, pinhole, 1, schedule[-1, 1], min_cosine, limit, True, H, b
-    )  # fmt: skip
+        if length < schedule[s, 3] ** 2 or done == schedule[s, 2]:
+            s, done = s + 1, 0
