@@ -71,7 +71,7 @@ class ExtractConfig:
     depth_window: int = option(1, "depth is the nearest pixel's, or the median of 3 x 3 or 5 x 5 [px]", choices=(1, 3, 5))
     depth_jump: float = option(
         0.03,
-        "a key point has no depth where depth jumps beside it by more than this share: no fixed point of a surface; 0 = all have",
+        "a key point has no depth where depth jumps beside it by more than this share, of an image 640 px wide: no fixed point of a surface; 0 = all have",
         ge=0,
         le=1,
     )

@@ -63,7 +63,9 @@ def test_features_are_those_of_each_frame(room: Path, features: Features) -> Non
         column, row = np.rint(points.xy).astype(int).T
         depth, found = dataset.depth(i), np.isfinite(features.depth[span])
         np.testing.assert_array_equal(features.depth[span][found], depth[row, column][found])
-        is_without = np.isnan(depth[row, column]) | extract.is_at_jump(depth, points.xy, jump=Config().extract.depth_jump)
+        is_without = np.isnan(depth[row, column]) | extract.is_at_jump(
+            depth, points.xy, jump=extract.least_jump(Config().extract, depth.shape[1])
+        )
         np.testing.assert_array_equal(~found, is_without)
     assert 0.3 < np.isfinite(features.depth).mean() <= 1.0
 

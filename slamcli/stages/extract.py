@@ -16,6 +16,7 @@ from slamcli.parallel import ordered_map
 from slamcli.schema import Features
 from slamcli.vision import orb
 
+USUAL_WIDTH = 640  # px
 JUMP_REACH = 3  # px to either side of a key point where a jump of depth is looked for: as far as FAST looks
 
 
@@ -73,7 +74,7 @@ def _extract(dataset: Dataset, settings: ExtractConfig, i: int) -> _Frame:
         return _Frame(points, np.full(len(points), np.nan, np.float32), has_depth=False, faults=faults)
     read = depth_at(depth, points.xy, window=settings.depth_window)
     if settings.depth_jump:
-        read = np.where(is_at_jump(depth, points.xy, jump=settings.depth_jump), np.float32(np.nan), read)
+        read = np.where(is_at_jump(depth, points.xy, jump=least_jump(settings, depth.shape[1])), np.float32(np.nan), read)
     return _Frame(points, read, has_depth=True, faults=faults)
 
 
@@ -108,6 +109,11 @@ def depth_at(depth: np.ndarray, xy: np.ndarray, *, window: int = 1) -> np.ndarra
     readings = np.sort(depth[rows[:, :, None], columns[:, None, :]].reshape(len(xy), window * window), axis=1)  # NaN last
     n = np.isfinite(readings).sum(axis=1)
     return readings[np.arange(len(xy)), np.maximum(n - 1, 0) // 2]
+
+
+def least_jump(settings: ExtractConfig, width: int) -> float:
+    """Give the share that counts as a jump: in a small image as many pixels span a wider angle, and each fold of a surface bends more."""
+    return settings.depth_jump * max(1.0, USUAL_WIDTH / width)
 
 
 def is_at_jump(depth: np.ndarray, xy: np.ndarray, *, jump: float) -> np.ndarray:
