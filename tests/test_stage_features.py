@@ -63,9 +63,7 @@ def test_features_are_those_of_each_frame(room: Path, features: Features) -> Non
         column, row = np.rint(points.xy).astype(int).T
         depth, found = dataset.depth(i), np.isfinite(features.depth[span])
         np.testing.assert_array_equal(features.depth[span][found], depth[row, column][found])
-        is_without = np.isnan(depth[row, column]) | extract.is_at_jump(
-            depth, points.xy, jump=extract.least_jump(Config().extract, depth.shape[1])
-        )
+        is_without = np.isnan(depth[row, column]) | extract.is_at_jump(depth, points.xy, jump=Config().extract.depth_jump)
         np.testing.assert_array_equal(~found, is_without)
     assert 0.3 < np.isfinite(features.depth).mean() <= 1.0
 
@@ -100,7 +98,7 @@ def test_camera_and_association_are_written_for_other_programs(room: Path, tmp_p
 
 
 def test_a_jump_of_depth_is_told_from_a_slope_a_fold_and_a_hole() -> None:
-    v, u = np.mgrid[:60, :80].astype(float)
+    v, u = np.mgrid[:60, :640].astype(float)
     slope = 1.0 / (0.2 + 0.004 * u + 0.001 * v)  # a plane: 5 m on the left, 1.9 m on the right
     fold = 1.0 / (0.4 + 0.002 * np.abs(u - 40))
     step = np.where(u < 40, 2.0, 2.3)
