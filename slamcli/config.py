@@ -93,7 +93,7 @@ class ExtractConfig:
     )
     depth_jump: float = option(
         0.03,
-        "a key point has no depth where depth jumps beside it by more than this share: no fixed point of a surface; 0 = all have",
+        "a key point has no depth where depth jumps beside it by more than this share, of an image 640 px wide: no fixed point of a surface; 0 = all have",
         ge=0,
         le=1,
     )

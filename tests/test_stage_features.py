@@ -98,7 +98,7 @@ def test_camera_and_association_are_written_for_other_programs(room: Path, tmp_p
 
 
 def test_a_jump_of_depth_is_told_from_a_slope_a_fold_and_a_hole() -> None:
-    v, u = np.mgrid[:60, :80].astype(float)
+    v, u = np.mgrid[:60, :640].astype(float)
     slope = 1.0 / (0.2 + 0.004 * u + 0.001 * v)  # a plane: 5 m on the left, 1.9 m on the right
     fold = 1.0 / (0.4 + 0.002 * np.abs(u - 40))
     step = np.where(u < 40, 2.0, 2.3)

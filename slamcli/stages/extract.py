@@ -17,6 +17,7 @@ from slamcli.parallel import ordered_map
 from slamcli.schema import CoarseDepth, Features
 from slamcli.vision import orb
 
+USUAL_WIDTH = 640  # px
 JUMP_REACH = 3  # px to either side of a key point where a jump of depth is looked for: as far as FAST looks
 
 
@@ -119,7 +120,8 @@ def is_at_jump(depth: np.ndarray, xy: np.ndarray, *, jump: float) -> np.ndarray:
     """Say which raw points xy (N, 2) stand where depth (H, W) [m] jumps by more than the share `jump`, (N,) bool.
 
     The outline of a thing before another is no fixed point in space, and a pixel more to the side its depth is that of the other.
-    Along a line over a plane, however slanted, the inverse of depth is linear in pixels: where it bends, the surface ends.
+    Along a line over a plane, however slanted, the inverse of depth is linear in pixels: where it bends, the surface ends. In an image
+    less than 640 pixels wide as many pixels span a wider angle, and each fold of a surface bends more: `jump` grows in proportion.
     """
     column, row = np.rint(xy).astype(np.int64).T
 
@@ -127,9 +129,10 @@ def is_at_jump(depth: np.ndarray, xy: np.ndarray, *, jump: float) -> np.ndarray:
         rows = np.clip(row + JUMP_REACH * down, 0, depth.shape[0] - 1)
         return 1.0 / depth[rows, np.clip(column + JUMP_REACH * right, 0, depth.shape[1] - 1)]
 
+    least = jump * max(1.0, USUAL_WIDTH / depth.shape[1])
     here, found = inverse(0, 0), np.zeros(len(xy), dtype=bool)
     for down, right in ((0, 1), (1, 0), (1, 1), (1, -1)):
-        found |= np.abs(inverse(down, right) + inverse(-down, -right) - 2.0 * here) > jump * here
+        found |= np.abs(inverse(down, right) + inverse(-down, -right) - 2.0 * here) > least * here
     return found
 
 
