@@ -33,6 +33,7 @@ LEVERS = {  # how each is turned, and what it is
     "optimize.move_depth=false": "depth moved to the colour image's time",
     "optimize.depth_delay=false": "of that, the delay that the stamps do not show",
     "optimize.readout=false": "rolling shutter",
+    "optimize.shape_edges=0": "depth images of key frames aligned with each other",
     "loop.enabled=false": "loop closing",
     "loop.hindsight=false": "second look at every frame after loops are closed",
     "optimize.intrinsics=true": "intrinsics found as well, where the calibration is good",

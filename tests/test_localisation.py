@@ -35,9 +35,8 @@ def test_frames_are_found_where_the_run_has_them(slamcli, room, room_run, tmp_pa
     assert figures["coverage"] == 1.0 and figures["n_poses"] == len(found.stamp) == 20
     np.testing.assert_allclose(found.stamp - 3600, own.stamp[::2], atol=1e-5)
     apart = se3.log(se3.inverse(own.T_wc[::2]) @ found.T_wc)  # in the run's own frame: nothing is aligned
-    distance, angle = np.linalg.norm(apart[:, :3], axis=1), np.linalg.norm(apart[:, 3:], axis=1)
-    assert 0.0 < np.quantile(distance, 0.9) < 0.01 and distance.max() < 0.03
-    assert np.quantile(angle, 0.9) < 0.005 and angle.max() < 0.015
+    assert 0.0 < np.linalg.norm(apart[:, :3], axis=1).max() < 0.01
+    assert np.linalg.norm(apart[:, 3:], axis=1).max() < 0.005
     assert {path: path.stat().st_mtime_ns for path in room_run.rglob("*")} == before
 
 
