@@ -1,12 +1,12 @@
 #!/usr/bin/env python
 """What each lever gives: the error with it and without it, everything else at its default.
 
-    python scripts/ablation.py OUT RECORDING... [--offsets 0 1] [--seeds 0 1] [--levers KEY...] [--json ablation.json] [--readme README.md]
+    python scripts/ablation.py OUT RECORDING... [--offsets 0 1] [--seeds 0 1] [--levers KEY...] [--json ablation.json] [--page docs/accuracy.md]
 
 Each recording is run from each start frame with each seed under the default configuration, and again with each lever turned: off where it
 is on by default, on where it is off. What a lever does not concern is taken over, so that a pair differs in nothing else. The gain is the
 APE (RMSE, SE(3), no scale, after loop) without the lever minus that with it, in mm. Pairs that --json finds in its file are kept unless they
-are measured again; --readme puts the table between the marks in that file. Without RECORDING only the table is made.
+are measured again; --page puts the table between the marks in that file. Without RECORDING only the table is made.
 """
 
 import argparse
@@ -38,7 +38,7 @@ LEVERS = {  # how each is turned, and what it is
     "loop.hindsight=false": "second look at every frame after loops are closed",
     "optimize.intrinsics=true": "intrinsics found as well, where the calibration is good",
 }
-MARKS = "<!-- ablation: scripts/ablation.py --readme -->", "<!-- end of ablation -->"
+MARKS = "<!-- ablation: scripts/ablation.py --page -->", "<!-- end of ablation -->"
 
 
 def main() -> None:
@@ -50,7 +50,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1])
     parser.add_argument("--levers", nargs="+", choices=LEVERS, default=list(LEVERS), metavar="KEY=VALUE")
     parser.add_argument("--json", type=Path, metavar="FILE", help="figures, read and written")
-    parser.add_argument("--readme", type=Path, metavar="FILE", help="put the table into this file")
+    parser.add_argument("--page", type=Path, metavar="FILE", help="put the table into this file")
     given = parser.parse_args()
     try:
         pairs = json.loads(given.json.read_text(encoding="utf-8")) if given.json and given.json.exists() else []
@@ -59,8 +59,8 @@ def main() -> None:
             if given.json:
                 given.json.write_text(json.dumps(pairs, indent=1) + "\n", encoding="utf-8")
         print(table(pairs))
-        if given.readme:
-            bench.put_into(given.readme, table(pairs), MARKS)
+        if given.page:
+            bench.put_into(given.page, table(pairs), MARKS)
     except SlamError as error:
         sys.exit(f"Error: {error}")
 
