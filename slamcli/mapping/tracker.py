@@ -153,7 +153,8 @@ class Tracker(Localiser):
         x_w = se3.transform(T_wc, self.camera.backproject(frame.xy[new], frame.depth[new]))
         added = builder.add_landmarks(kf, frame.first_row + new, x_w)
         self.places.add(kf, *word_vector(self.words, i))
-        if self.state[i] == ON_SHAPE:
+        # Landmarks enough to recognise a place by hold the key frame; shape alone might slide along a corridor.
+        if self.state[i] == ON_SHAPE and len(known) < self.settings.relocalise_inliers:
             self.shape.join(kf)
         self.ref_kf[i], self.T_kc[i], self.state[i], self._latest, self._surely = kf, np.eye(4), KEY_FRAME, i, i
         self._cull(kf)
