@@ -47,7 +47,7 @@ def test_cells_are_doubted_from_the_second_miss_until_they_are_free(misses: int,
 def test_frames_are_asked_that_look_there_after_the_last_hit_and_no_more_than_can_turn_it() -> None:
     grid = box_taken_away(3)
     poses = [(frame, facing(np.pi if frame % 3 == 0 else 0.0)) for frame in range(100)]
-    chosen = [frame for frame, _ in changes.witnesses(grid, poses, CAMERA, max_range=3.2)]
+    chosen = [frame for frame, _ in changes.witnesses(grid, poses, CAMERA, max_range=3.2, most=50)]
     assert chosen == [frame for frame in range(LAST_SEEN + 1, 100) if frame % 3][: grid.looks]
     assert grid.looks == 9  # ln(0.971 / 0.029) / ln(0.6 / 0.4) = 8.66
     for frame in chosen:
@@ -57,9 +57,17 @@ def test_frames_are_asked_that_look_there_after_the_last_hit_and_no_more_than_ca
 
 def test_nobody_is_asked_without_need_or_where_nobody_can_see() -> None:
     poses = [(frame, facing()) for frame in range(41, 60)]
-    assert changes.witnesses(box_taken_away(0), poses, CAMERA, max_range=3.2) == []
+    assert changes.witnesses(box_taken_away(0), poses, CAMERA, max_range=3.2, most=50) == []
     grid = box_taken_away(3)
-    assert len(changes.witnesses(grid, poses, CAMERA, max_range=3.2)) == grid.looks
-    assert changes.witnesses(grid, poses, CAMERA, max_range=1.0) == []
-    assert changes.witnesses(grid, [(frame, facing(np.pi)) for frame, _ in poses], CAMERA, max_range=0.0) == []
-    assert changes.witnesses(grid, [], CAMERA, max_range=0.0) == []
+    assert len(changes.witnesses(grid, poses, CAMERA, max_range=3.2, most=50)) == grid.looks
+    assert changes.witnesses(grid, poses, CAMERA, max_range=1.0, most=50) == []
+    assert changes.witnesses(grid, [(frame, facing(np.pi)) for frame, _ in poses], CAMERA, max_range=0.0, most=50) == []
+    assert changes.witnesses(grid, [], CAMERA, max_range=0.0, most=50) == []
+
+
+def test_the_more_there_would_be_the_sparser_they_are_asked() -> None:
+    grid, poses = box_taken_away(3), [(frame, facing()) for frame in range(41, 60)]
+    chosen = [frame for frame, _ in changes.witnesses(grid, poses, CAMERA, max_range=3.2, most=50)]
+    for most, step in ((len(chosen), 1), (len(chosen) - 1, 2), (3, 3), (1, len(chosen))):
+        fewer = changes.witnesses(grid, poses, CAMERA, max_range=3.2, most=most)
+        assert [frame for frame, _ in fewer] == chosen[::step] and len(fewer) <= most

@@ -18,11 +18,14 @@ CELLS = 16  # doubted cells side by side that are more than an edge
 TOUCHING = 1.8  # cells from centre to centre: neighbours by face, edge or corner
 
 
-def witnesses(grid: OccupancyMap, poses: list[tuple[int, np.ndarray]], camera: Camera, *, max_range: float) -> list[tuple[int, np.ndarray]]:
+def witnesses(
+    grid: OccupancyMap, poses: list[tuple[int, np.ndarray]], camera: Camera, *, max_range: float, most: int
+) -> list[tuple[int, np.ndarray]]:
     """Choose frames that look where something seems to have vanished, after it was last seen, as many as can turn its cells.
 
     poses : (frame, T_lc (4, 4) camera to the map's frame), in the order of time, of frames not inserted yet
     max_range : of the rays [m], 0 = no limit
+    most : frames to choose; of more, every second, third ... is taken: the noise of a sensor can feign change in every view
     """
     centre, last_hit = _vanished(grid)
     missing = np.full(len(centre), grid.looks)
@@ -35,7 +38,7 @@ def witnesses(grid: OccupancyMap, poses: list[tuple[int, np.ndarray]], camera: C
         if np.count_nonzero(sees & (missing > 0)) >= CELLS:
             missing[sees] -= 1
             chosen.append((frame, T_lc))
-    return chosen
+    return chosen[:: -(-len(chosen) // most)] if len(chosen) > most > 0 else chosen
 
 
 def _vanished(grid: OccupancyMap) -> tuple[np.ndarray, np.ndarray]:

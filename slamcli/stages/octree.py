@@ -56,10 +56,11 @@ def rounds(inputs: Any, grid: OccupancyMap, option: OctreeConfig) -> Iterator[li
         yield poses
         return
     chosen = {frame for frame, _ in depth_poses(inputs)}
+    n_key_frames = len(chosen)
     yield [pose for pose in poses if pose[0] in chosen]
     for _ in range(ROUNDS if option.frames == "auto" else 0):
         poses = [pose for pose in poses if pose[0] not in chosen]
-        asked = changes.witnesses(grid, poses, inputs.camera("loop"), max_range=option.max_range)
+        asked = changes.witnesses(grid, poses, inputs.camera("loop"), max_range=option.max_range, most=n_key_frames)
         chosen = {frame for frame, _ in asked}
         yield asked
 
