@@ -37,7 +37,9 @@ def box_taken_away(misses: int) -> OccupancyMap:
 
 @pytest.mark.parametrize(("misses", "is_doubted"), [(0, False), (changes.MISSES - 1, False), (changes.MISSES, True), (20, False)])
 def test_cells_are_doubted_from_the_second_miss_until_they_are_free(misses: int, is_doubted: bool) -> None:
-    centre, last_hit = box_taken_away(misses).doubted(changes.MISSES)
+    grid = box_taken_away(misses)
+    cell, last_hit = grid.doubted(changes.MISSES)
+    centre = grid.centre(cell)
     assert (len(centre) > 30) == is_doubted
     assert len(centre) == len(last_hit)
     assert (last_hit == LAST_SEEN).all()
@@ -71,3 +73,17 @@ def test_the_more_there_would_be_the_sparser_they_are_asked() -> None:
     for most, step in ((len(chosen), 1), (len(chosen) - 1, 2), (3, 3), (1, len(chosen))):
         fewer = changes.witnesses(grid, poses, CAMERA, max_range=3.2, most=most)
         assert [frame for frame, _ in fewer] == chosen[::step] and len(fewer) <= most
+
+
+def test_groups_are_those_of_a_graph_library() -> None:
+    from scipy.ndimage import label
+
+    rng = np.random.default_rng(0)
+    for density in (0.02, 0.1, 0.3):
+        volume = rng.random((20, 25, 30)) < density
+        expected, n = label(volume, structure=np.ones((3, 3, 3)))
+        group = changes._components(np.argwhere(volume) + 1000)
+        assert len(np.unique(group)) == n
+        for k in range(1, n + 1):
+            assert len(np.unique(group[expected[volume] == k])) == 1
+    assert len(changes._components(np.empty((0, 3), dtype=np.int64))) == 0

@@ -5,17 +5,14 @@ There, and only there, the frames between are asked too.
 """
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
-from slamcli.geometry import se3
+from slamcli.geometry import se3, voxel
 from slamcli.geometry.camera import Camera
 from slamcli.mapping.occupancy import OccupancyMap
 
 MISSES = 2  # in a row: one alone is mostly noise at an edge
 CELLS = 16  # doubted cells side by side that are more than an edge
-TOUCHING = 1.8  # cells from centre to centre: neighbours by face, edge or corner
+HALF_AROUND = [(x, y, z) for z in (-1, 0, 1) for y in (-1, 0, 1) for x in (-1, 0, 1)][14:]  # neighbours by face, edge or corner, one of two
 
 
 def witnesses(
@@ -43,12 +40,30 @@ def witnesses(
 
 def _vanished(grid: OccupancyMap) -> tuple[np.ndarray, np.ndarray]:
     """Give doubted cells that lie side by side: their centres (N, 3) [m] and the frame of each one's last hit (N,)."""
-    centre, last_hit = grid.doubted(MISSES)
-    pairs = cKDTree(centre).query_pairs(TOUCHING * grid.resolution, output_type="ndarray")
-    adjacency = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(centre), len(centre)))
-    _, group = connected_components(adjacency, directed=False)
+    cell, last_hit = grid.doubted(MISSES)
+    group = _components(cell)
     is_large = np.bincount(group, minlength=1)[group] >= CELLS
-    return centre[is_large], last_hit[is_large]
+    return grid.centre(cell[is_large]), last_hit[is_large]
+
+
+def _components(cell: np.ndarray) -> np.ndarray:
+    """Number (N,) the groups of touching cells (N, 3): the smallest row in each, spread from neighbour to neighbour."""
+    key = voxel.morton(cell)
+    order = np.argsort(key)
+    pairs = [np.empty((0, 2), dtype=np.int64)]
+    for step in HALF_AROUND:
+        beside = voxel.morton(cell + step)
+        at = order[np.minimum(np.searchsorted(key, beside, sorter=order), len(order) - 1)] if len(order) else order
+        touching = np.flatnonzero(key[at] == beside)
+        pairs.append(np.column_stack([touching, at[touching]]))
+    a, b = np.concatenate(pairs).T
+    group, before = np.arange(len(cell)), None
+    while before is None or (group != before).any():
+        before = group.copy()
+        np.minimum.at(group, a, before[b])
+        np.minimum.at(group, b, before[a])
+        group = group[group]
+    return group
 
 
 def _is_in_view(x_c: np.ndarray, camera: Camera) -> np.ndarray:

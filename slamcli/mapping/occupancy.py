@@ -85,12 +85,16 @@ class OccupancyMap:
     def doubted(self, misses: int) -> tuple[np.ndarray, np.ndarray]:
         """Find cells that are occupied, but that the last so many scans that touched them saw free.
 
-        Returns their centres (N, 3) [m] and the frame of the last scan that hit each (N,).
+        Returns their numbers (N, 3) x y z and the frame of the last scan that hit each (N,).
         """
         columns = {name: column[: self._blocks.n] for name, column in self._blocks.columns.items()}
         block, local = np.nonzero((columns["log_odds"] > 0.0) & (columns["misses"] >= misses))
         cell = voxel.unmorton((self._blocks.row_key[block] << 9) + local)
-        return (cell - CENTRE + 0.5) * self.resolution, columns["last_hit"][block, local]
+        return cell, columns["last_hit"][block, local]
+
+    def centre(self, cell: np.ndarray) -> np.ndarray:
+        """Give the centres (N, 3) [m] of cells (N, 3)."""
+        return (cell - CENTRE + 0.5) * self.resolution
 
     def leaves(self) -> Octree:
         """Give the known cells as an octree that is not pruned."""
