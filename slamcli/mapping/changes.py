@@ -12,6 +12,7 @@ from slamcli.mapping.occupancy import OccupancyMap
 
 MISSES = 2  # in a row: one alone is mostly noise at an edge
 CELLS = 16  # doubted cells side by side that are more than an edge
+AT_ONCE = 64  # frames: all of a long recording at once would fill the memory
 HALF_AROUND = [(x, y, z) for z in (-1, 0, 1) for y in (-1, 0, 1) for x in (-1, 0, 1)][14:]  # neighbours by face, edge or corner, one of two
 
 
@@ -27,14 +28,17 @@ def witnesses(
     centre, last_hit = _vanished(grid)
     missing = np.full(len(centre), grid.looks)
     chosen = []
-    for frame, T_lc in poses if len(centre) else []:
-        x_c = se3.transform(se3.inverse(T_lc), centre)
-        sees = _is_in_view(x_c, camera) & (frame > last_hit)
+    for first in range(0, len(poses) if len(centre) else 0, AT_ONCE):
+        part = poses[first : first + AT_ONCE]
+        T_cl = se3.inverse(np.array([T for _, T in part]))
+        x_c = np.einsum("pij,cj->pci", T_cl[:, :3, :3], centre) + T_cl[:, None, :3, 3]
+        sees = _is_in_view(x_c, camera) & (np.array([frame for frame, _ in part])[:, None] > last_hit)
         if max_range > 0.0:
-            sees &= np.linalg.norm(x_c, axis=1) < max_range
-        if np.count_nonzero(sees & (missing > 0)) >= CELLS:
-            missing[sees] -= 1
-            chosen.append((frame, T_lc))
+            sees &= np.einsum("pci,pci->pc", x_c, x_c) < max_range**2
+        for pose, cells in zip(part, sees, strict=True):
+            if np.count_nonzero(cells & (missing > 0)) >= CELLS:
+                missing[cells] -= 1
+                chosen.append(pose)
     return chosen[:: -(-len(chosen) // most)] if len(chosen) > most > 0 else chosen
 
 
@@ -67,7 +71,7 @@ def _components(cell: np.ndarray) -> np.ndarray:
 
 
 def _is_in_view(x_c: np.ndarray, camera: Camera) -> np.ndarray:
-    """Say of points (N, 3) [m, camera] whether they lie in the picture, lens distortion aside."""
-    xy = camera.project(np.where(x_c[:, 2:] > 0.0, x_c, np.nan))
+    """Say of points (..., 3) [m, camera] whether they lie in the picture, lens distortion aside."""
+    xy = camera.project(np.where(x_c[..., 2:] > 0.0, x_c, np.nan))
     with np.errstate(invalid="ignore"):
-        return ((xy >= 0.0) & (xy < [camera.width, camera.height])).all(axis=1)
+        return ((xy >= 0.0) & (xy < [camera.width, camera.height])).all(axis=-1)
