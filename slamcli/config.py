@@ -211,7 +211,15 @@ class LoopConfig:
     iterations: int = option(20, "rounds of each global bundle adjustment at most", ge=1)
     join_closures: int = option(2, "closures that must agree on how two map segments lie before these are joined", ge=1)
     main_segment: int = option(0, "map segment the maps are made of, where some could not be joined: 0 = the largest", ge=0)
-    hindsight: bool = option(True, "match every frame again against the final map and refine it")
+    hindsight: bool = option(
+        True, "once loops are closed, align depth images of key frames again and match every frame again against the final map"
+    )
+    shape_edges: int = option(
+        6,
+        "earlier key frames that each one's depth image is aligned with then, besides the landmarks that both see; 0 = none: 3 to 17 % more APE in simulated rooms, 0.5 % less on fr1_xyz",
+        ge=0,
+        le=50,
+    )
 
 
 @dataclass(frozen=True)

@@ -10,11 +10,12 @@ from test_surface import KINECT, noisy
 
 from slamcli.config import LoopConfig, SensorConfig, TrackConfig
 from slamcli.geometry import se3
-from slamcli.mapping import adjustment, closure, surface
+from slamcli.mapping import adjustment, closure, hindsight, surface
 from slamcli.mapping.mapbuilder import MapBuilder
+from slamcli.mapping.selfcalibration import Sensing
 from slamcli.mapping.shape import Reliefs, Shape
 from slamcli.mapping.tracker import Tracker
-from slamcli.schema import KEY_FRAME, LOST, ON_SHAPE, CoarseDepth, Features, Matches, Words, frame_poses
+from slamcli.schema import KEY_FRAME, LOST, ON_SHAPE, CoarseDepth, Features, Matches, Timing, Tracks, Words, frame_poses
 
 SENSOR = SensorConfig()
 RATE = 15.0
@@ -157,3 +158,49 @@ def test_edges_hold_for_the_instants_of_the_colour_images():
     assert Shape(builder, reliefs, reliefs).join_pair(1, 0, T_cd)
     e = se3.log(builder.edge.T_ij[0] @ se3.inverse(builder.kf.T_wk[0]) @ builder.kf.T_wk[1])
     assert np.linalg.norm(e) < 0.006
+
+
+def revisit(frames: list[int], *, n: int = 60, pixel_noise: float = 2.0) -> MapBuilder:
+    """A map of true key frames at `frames` of the drive, that all see the same n landmarks, as bearings with coarse noise."""
+    rng, T_wc = np.random.default_rng(5), turn(14)[frames]
+    x_c = np.stack([rng.uniform(-0.3, 0.3, n), rng.uniform(-0.3, 0.3, n), rng.uniform(1.5, 3.0, n)], axis=1)
+    xyz = se3.transform(T_wc[0], x_c)
+    xy = np.concatenate([KINECT.project(se3.transform(se3.inverse(T), xyz)) for T in T_wc])
+    stamp, rows = 10.0 + np.arange(len(frames)) / RATE, n * len(frames)
+    features = Features(
+        stamp=stamp, depth_stamp=stamp.copy(), offset=n * np.arange(len(frames) + 1), xy=(xy + rng.normal(0, pixel_noise, xy.shape)).astype("f4"),
+        depth=np.full(rows, np.nan, "f4"), octave=np.zeros(rows, "u1"), angle=np.zeros(rows, "f4"),
+        desc=np.tile(rng.integers(0, 256, (n, 32), dtype=np.uint8), (len(frames), 1)), octave_scale=np.array(1.2),
+    )  # fmt: skip
+    builder = MapBuilder(features)
+    for k, T in enumerate(T_wc):
+        builder.add_key_frame(k, T)
+    ids = builder.add_landmarks(0, np.arange(n), xyz)
+    for k in range(len(frames)):
+        builder.observe(k, ids, np.arange(k * n, (k + 1) * n))
+    return builder
+
+
+@pytest.mark.parametrize("most", [0, 1, 6])
+def test_a_second_look_joins_key_frames_that_see_the_same_and_moves_them_to_where_depth_shows_them(most):
+    frames = [0, 2, 4, 6]
+    builder = revisit(frames)
+    n = len(frames)
+    tracks = Tracks(
+        ref_kf=np.arange(n, dtype=np.int32),
+        T_kc=np.tile(np.eye(4), (n, 1, 1)),
+        state=np.full(n, KEY_FRAME, np.uint8),
+        n_inliers=np.full(n, 60, np.int32),
+    )
+    reliefs = Reliefs(CoarseDepth(corner().coarse_depth[frames]), KINECT, SENSOR)
+    sensing = Sensing(KINECT, Timing(np.array(0.0), np.array(0.0), np.zeros((n, 6))), {})
+    look = {"reliefs": reliefs, "iterations": 20, "progress": lambda items, label: items}
+    after, result = hindsight.look_again(builder, tracks, sensing, SENSOR, TrackConfig(), shape_edges=most, **look)
+    assert len(builder.edge) == {0: 0, 1: 3, 6: 6}[most]
+    assert (after.state == KEY_FRAME).all() and result.cost[-1] < result.cost[0]
+    true = turn(14)[frames]
+    e = se3.log((se3.inverse(builder.kf.T_wk[0]) @ builder.kf.T_wk) @ se3.inverse(se3.inverse(true[0]) @ true))
+    error = np.linalg.norm(e[1:, :3], axis=1).mean()
+    assert 1e-4 < error < 0.01 if most else error > 0.02
+    hindsight.look_again(builder, after, sensing, SENSOR, TrackConfig(), shape_edges=most, **look)
+    assert len(builder.edge) == {0: 0, 1: 3, 6: 6}[most], "no pair is joined twice"

@@ -1,17 +1,47 @@
-"""The second look: every frame is matched again against the final map. Only a batch program can do this."""
+"""The second look: the depth images of key frames and then every frame meet the final map again. Only a batch program can do this."""
 
 import numpy as np
 
 from slamcli.config import SensorConfig, TrackConfig
 from slamcli.geometry import se3
 from slamcli.geometry.camera import Camera
-from slamcli.mapping import projection
+from slamcli.mapping import adjustment, projection, timing
+from slamcli.mapping.bundle import BundleResult
 from slamcli.mapping.localiser import estimate_pose, frame_features
 from slamcli.mapping.mapbuilder import MapBuilder
+from slamcli.mapping.selfcalibration import Sensing
+from slamcli.mapping.shape import Reliefs, Shape
 from slamcli.schema import KEY_FRAME, LOST, ON_SHAPE, RELOCALISED, Features, Tracks
 
+SHARED = 30  # landmarks of two key frames whose depth images are aligned too
 NEIGHBOURS = 20  # covisible key frames whose landmarks are looked for
 LOST_WIDENING = 8.0  # a lost frame's neighbour stands where a frame's fast turn leaves it, some tens of pixels off
+
+
+def look_again(
+    builder: MapBuilder,
+    tracks: Tracks,
+    sensing: Sensing,
+    sensor: SensorConfig,
+    settings: TrackConfig,
+    *,
+    reliefs: Reliefs,
+    shape_edges: int,
+    iterations: int,
+    progress,
+) -> tuple[Tracks, BundleResult | None]:
+    """Align each key frame's depth image with those of up to `shape_edges` covisible ones, adjust the map, refine every frame against it.
+
+    builder : its map is changed; its features are those that `sensing` corrected
+    reliefs : of the recording, of which depth images are taken
+    Returns the refined tracks, and the evidence of the adjustment, None where nothing ties two key frames together.
+    """
+    if shape_edges:
+        T_cd = timing.depth_to_colour(builder.features, sensing.timing, builder.kf.frame)
+        Shape(builder, reliefs, reliefs).join_covisible(T_cd, most=shape_edges, least=SHARED)
+    kfs = np.arange(len(builder.kf), dtype=np.int32)
+    result = adjustment.adjust(builder, kfs, sensing.camera, sensor, max_iterations=iterations)
+    return refine_frames(builder, builder.features, tracks, sensing.camera, sensor, settings, progress), result
 
 
 def refine_frames(

@@ -19,7 +19,7 @@ from slamcli.vision import hamming, vocabulary
 NO_RELIEFS = NoReliefs()
 SEARCH_KEY_FRAMES = 3  # around, that a frame is aligned with when the key frame before it does not do
 FEW = 10  # landmarks that help shape; fewer are found anywhere
-SEARCH_SECONDS = 2.0  # after so long without a pose, what looks like the shape around the last one may be any placeSEARCH_KEY_FRAMES = 2  # around, that such a frame is aligned with when the key frame before does not do
+SEARCH_SECONDS = 2.0  # after so long without a pose, what looks like the shape around the last one may be any place
 # [1/m^2, 1/rad^2] what is known of the motion from one frame to the next when it goes on as before: within 10 mm and 0.6 degrees.
 STEADY = 1e4 * np.eye(6)
 

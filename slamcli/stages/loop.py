@@ -1,4 +1,4 @@
-"""loop: places seen again are joined, the whole map is adjusted, and every frame is refined against it."""
+"""loop: places seen again are joined, the whole map is adjusted, and every key frame and frame meets it once more."""
 
 import csv
 import itertools
@@ -12,23 +12,35 @@ from slamcli.mapping import adjustment, closure, hindsight, posegraph, segments,
 from slamcli.mapping.closure import Candidate
 from slamcli.mapping.mapbuilder import MapBuilder
 from slamcli.mapping.selfcalibration import Sensing
-from slamcli.schema import LOST, Closures, Features, Map, Timing, Tracks, Words
+from slamcli.mapping.shape import Reliefs
+from slamcli.schema import LOST, Closures, CoarseDepth, Features, Map, Timing, Tracks, Words
 from slamcli.stages.extract import write_camera
 from slamcli.stages.track import save_map_stage, segment_file, segments_apart
 
 
 def run(inputs, out: Path, cfg, tools) -> dict:
-    """Join map segments and close loops until no new one appears; then look at every frame again."""
+    """Join map segments and close loops until no new one appears; then look at all key frames and frames again."""
     words, tracks = inputs.load(Words, "match"), inputs.load(Tracks, "optimize")
     when, camera = inputs.load(Timing, "optimize"), inputs.camera("optimize")
-    features = selfcalibration.correct(inputs.load(Features, "extract"), inputs.camera(), Sensing(camera, when, {}))
+    given, sensing = inputs.camera(), Sensing(camera, when, {})
+    features = selfcalibration.correct(inputs.load(Features, "extract"), given, sensing)
     builder = MapBuilder.from_map(features, inputs.load(Map, "optimize"))
     tried: list[Candidate] = []
     if cfg.loop.enabled and len(builder.kf) > 2:
         tried = close_loops(builder, words, camera, cfg, tools)
     accepted = [c for c in tried if c.is_accepted]
     if accepted and cfg.loop.hindsight:
-        tracks = hindsight.refine_frames(builder, features, tracks, camera, cfg.sensor, cfg.track, tools.progress)
+        tracks, _ = hindsight.look_again(
+            builder,
+            tracks,
+            sensing,
+            cfg.sensor,
+            cfg.track,
+            reliefs=Reliefs(inputs.load(CoarseDepth, "extract"), given, cfg.sensor),
+            shape_edges=cfg.loop.shape_edges,
+            iterations=cfg.loop.iterations,
+            progress=tools.progress,
+        )
     write_pose_graph(out / "posegraph.g2o", builder, accepted, cfg.loop)
     write_candidates(out / "candidates.csv", tried)
     map_ = main_first(builder.snapshot(), tracks, cfg.loop.main_segment)

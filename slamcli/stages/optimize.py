@@ -10,12 +10,10 @@ from slamcli.mapping import adjustment, hindsight, selfcalibration, timing
 from slamcli.mapping.localiser import NO_RELIEFS
 from slamcli.mapping.mapbuilder import MapBuilder
 from slamcli.mapping.selfcalibration import Sensing
-from slamcli.mapping.shape import Reliefs, Shape
+from slamcli.mapping.shape import Reliefs
 from slamcli.schema import CoarseDepth, Features, Map, Timing, Tracks
 from slamcli.stages.extract import write_camera
 from slamcli.stages.track import save_map_stage
-
-SHARED = 30  # landmarks of two key frames whose depth images are aligned too
 
 
 def run(inputs, out: Path, cfg, tools) -> dict:
@@ -57,11 +55,17 @@ def refine(
         sensing = replace(found, timing=replace(found.timing, twist=twist))
         cost.append(result.cost[-1])
     builder.features = selfcalibration.correct(features, given, sensing)
-    if cfg.optimize.shape_edges:
-        T_cd = timing.depth_to_colour(features, sensing.timing, builder.kf.frame)
-        Shape(builder, reliefs, reliefs).join_covisible(T_cd, most=cfg.optimize.shape_edges, least=SHARED)
-    result = adjustment.adjust(builder, kfs, sensing.camera, cfg.sensor, max_iterations=cfg.optimize.iterations)
-    tracks = hindsight.refine_frames(builder, builder.features, tracks, sensing.camera, cfg.sensor, cfg.track, tools.progress)
+    tracks, result = hindsight.look_again(
+        builder,
+        tracks,
+        sensing,
+        cfg.sensor,
+        cfg.track,
+        reliefs=reliefs,
+        shape_edges=cfg.optimize.shape_edges,
+        iterations=cfg.optimize.iterations,
+        progress=tools.progress,
+    )
     summary = {} if result is None else {"cost": [*cost, result.cost[-1]], "outliers": int((~result.is_inlier).sum())}
     return tracks, sensing, summary
 
