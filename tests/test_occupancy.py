@@ -9,7 +9,8 @@ from slamcli.formats import octomap
 from slamcli.geometry import voxel
 from slamcli.geometry.octree import DEPTH, Octree, prune
 from slamcli.mapping import occupancy
-from slamcli.mapping.occupancy import FREE, OCCUPIED, OccupancyMap, Scan, mark_scan
+from slamcli.mapping.occupancy import OccupancyMap, Scan
+from slamcli.mapping.ray_casting import FREE, OCCUPIED, mark_scan
 
 MODEL = {"hit": 0.7, "miss": 0.4, "clamp_min": 0.1192, "clamp_max": 0.971}
 
