@@ -37,6 +37,7 @@ LEVERS = {  # how each is turned, and what it is
     "loop.enabled=false": "loop closing",
     "loop.hindsight=false": "second look at every frame after loops are closed",
     "optimize.intrinsics=true": "intrinsics found as well, where the calibration is good",
+    "optimize.depth_scale=true": "scale and offset of depth found as well",
 }
 MARKS = "<!-- ablation: scripts/ablation.py --page -->", "<!-- end of ablation -->"
 

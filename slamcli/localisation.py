@@ -76,8 +76,8 @@ def _find(run: RunDir, new: RunDir, config: Config, progress: Progress) -> Local
         config.track,
         config.sensor,
         np.random.default_rng(config.seed),
-        reliefs=Reliefs(new.load(CoarseDepth, "extract"), camera, config.sensor),
-        map_reliefs=Reliefs(run.load(CoarseDepth, "extract"), run.camera(), config.sensor),
+        reliefs=Reliefs(new.load(CoarseDepth, "extract"), new.camera(), config.sensor).under(camera),
+        map_reliefs=Reliefs(run.load(CoarseDepth, "extract"), given, config.sensor).under(run.camera("loop")),
     )
     for i in progress(range(len(features.stamp)), "localize"):
         localiser.process(i)

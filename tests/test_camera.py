@@ -1,5 +1,7 @@
 """The camera: laws of projection and distortion, OpenCV as oracle, intrinsics that cannot be right."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -62,6 +64,7 @@ def test_dict_round_trip():
         ({"width": 0}, "width"),
         ({"width": 640.5}, "width"),
         ({"depth_scale": 0.0}, "depth_scale"),
+        ({"inverse_depth_offset": 0.2}, "inverse_depth_offset"),
         ({"fx": "517"}, "fx"),
         ({"focal": 3.0}, "'focal' is not known"),
     ],
@@ -77,3 +80,20 @@ def test_missing_key():
     del values["fy"]
     with pytest.raises(SlamError, match="'fy' is missing"):
         Camera.from_dict(values, source="mine.toml")
+
+
+def test_depth_readings_become_metres_by_scale_and_offset():
+    camera = replace(FREIBURG1, depth_scale=1000.0, inverse_depth_offset=0.01)
+    assert np.isnan(camera.metres[0]) and len(camera.metres) == 1 << 16
+    np.testing.assert_allclose(camera.metres[[500, 1000, 4000]], [1 / (2.0 + 0.01), 1 / (1.0 + 0.01), 1 / (0.25 + 0.01)], rtol=1e-6)
+    behind_infinity = replace(camera, inverse_depth_offset=-0.1).metres
+    assert np.isfinite(behind_infinity[9000]) and np.isnan(behind_infinity[11000])
+
+
+def test_depth_read_under_another_calibration_is_that_of_its_readings():
+    given, camera = FREIBURG1, replace(FREIBURG1, depth_scale=4950.0, inverse_depth_offset=-0.004)
+    there = camera.reread(given.metres, given)
+    np.testing.assert_allclose(there, camera.metres, rtol=1e-5)
+    np.testing.assert_allclose(given.reread(there, camera), given.metres, rtol=1e-5)
+    assert camera.reread(np.zeros(1, np.float32), given)[0] == 0.0  # no reading stays none
+    assert given.reread(there, given) is there

@@ -137,7 +137,7 @@ class Recording:
         rng = np.random.default_rng(0)
         self._depth = [kinect_noise(render(T), rng) for T in T_lc]
 
-    def depth(self, i):
+    def depth(self, i, camera):
         if i == 3:
             raise BadFrame("depth/3.png: cannot be decoded")
         return None if i == 4 else self._depth[i]

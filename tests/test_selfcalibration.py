@@ -82,6 +82,26 @@ def test_intrinsics_that_were_put_in_are_found_within_their_sigma():
     assert found.sigma["fx"] < 1.0 and found.sigma["cx"] < 1.0 and found.sigma["fy"] > 0.9 * 0.02 * given.fy
 
 
+def test_an_offset_of_inverse_depth_is_found_within_its_sigma_and_a_factor_is_said_to_be_unknown():
+    scene, offset, factor = turn(0.25, frames=40), 0.02, 0.99
+    read = 1.0 / ((1.0 / scene.features.depth - offset) * factor)
+    shifted = replace(scene.features, depth=read.astype(np.float32))
+    option = OptimizeConfig(readout=False, depth_delay=False, depth_scale=True)
+    found = look(scene, shifted, CAMERA, option)
+    assert 1e-6 < abs(found.camera.inverse_depth_offset - offset) < 4.0 * found.sigma["inverse_depth_offset"]
+    assert found.sigma["inverse_depth_offset"] < 0.004
+    share = found.sigma["depth_scale"] / CAMERA.depth_scale
+    assert 0.95 * option.depth_scale_prior < share <= option.depth_scale_prior
+    # What is told of depth at all is at the depths seen, some 2 m: no size there has changed.
+    depth = found.camera.reread(np.array([2.0]), CAMERA)
+    assert abs(depth[0] / 2.0 - 1.0) < 0.02
+
+
+def test_depth_without_error_stays_as_it_was_read(scene):
+    found = look(scene, scene.features, CAMERA, OptimizeConfig(depth_scale=True))
+    assert found.camera == CAMERA
+
+
 def test_the_map_is_made_with_the_camera_that_was_found(tmp_path):
     """A guessed calibration bends the path; with it found, the path is as good as with the true one, and later stages know it."""
     scene, guess = turn(0.5, frames=80, per_frame=300), replace(CAMERA, fx=508.0, fy=508.0, cx=325.0)

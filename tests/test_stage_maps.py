@@ -240,7 +240,7 @@ class Broken:
     def __len__(self) -> int:
         return len(self._dataset)
 
-    def depth(self, i: int):
+    def depth(self, i: int, camera):
         from slamcli.errors import BadFrame
 
         if i in self._unreadable:

@@ -26,7 +26,7 @@ FREIBURG = {
 }  # fmt: skip
 CAMERA_FILES = ("camera.toml", "camera.json")
 MAX_BYTES = 1 << 20
-KEYS = "width height fx fy cx cy k1 k2 p1 p2 k3 depth_scale"
+KEYS = "width height fx fy cx cy k1 k2 p1 p2 k3 depth_scale inverse_depth_offset"
 
 
 def freiburg_number(name: str) -> int | None:

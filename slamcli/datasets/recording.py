@@ -4,7 +4,6 @@ import hashlib
 import json
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +11,6 @@ import numpy as np
 from slamcli.datasets import images
 from slamcli.geometry.camera import Camera
 from slamcli.schema import Trajectory
-
-DEPTH_VALUES = 1 << 16
 
 
 @dataclass(frozen=True)
@@ -45,11 +42,14 @@ class Dataset:
         """Decode frame i's colour image, (H, W, 3) uint8."""
         return images.decode_rgb(self.root / self.colour_path[i], self._size)
 
-    def depth(self, i: int) -> np.ndarray | None:
-        """Decode frame i's depth, (H, W) float32 [m], NaN where there is no reading; None where the frame has no depth image."""
+    def depth(self, i: int, camera: Camera | None = None) -> np.ndarray | None:
+        """Decode frame i's depth, (H, W) float32 [m], NaN where there is no reading; None where the frame has no depth image.
+
+        camera : what is known of the camera, where that is more than the recording's calibration
+        """
         if not self.depth_path[i]:
             return None
-        return self._metres[images.decode_depth(self.root / self.depth_path[i], self._size)]
+        return (camera or self.camera).metres[images.decode_depth(self.root / self.depth_path[i], self._size)]
 
     def ground_truth(self) -> Trajectory | None:
         """Give the true camera-to-world poses, None where the recording has none."""
@@ -67,13 +67,6 @@ class Dataset:
     @property
     def _size(self) -> tuple[int, int]:
         return self.camera.width, self.camera.height
-
-    @cached_property
-    def _metres(self) -> np.ndarray:
-        """Metres of every possible reading: one look-up replaces conversion, division and masking."""
-        metres = np.arange(DEPTH_VALUES, dtype=np.float32) / np.float32(self.camera.depth_scale)
-        metres[0] = np.nan
-        return metres
 
 
 def _bytes(root: Path, name: str) -> int:

@@ -10,6 +10,9 @@ import numpy as np
 
 from slamcli.errors import SlamError
 
+DEPTH_VALUES = 1 << 16  # of a 16-bit depth image
+MAX_INVERSE_DEPTH_OFFSET = 0.1  # [1/m]; a Kinect's is some thousandths
+
 
 @dataclass(frozen=True)
 class Camera:
@@ -27,6 +30,7 @@ class Camera:
     p2: float = 0.0
     k3: float = 0.0
     depth_scale: float = 5000.0  # units of the depth image per metre
+    inverse_depth_offset: float = 0.0  # 1/m, added to the inverse of each reading: a sensor that triangulates errs by a constant disparity
 
     def __post_init__(self) -> None:
         for name in (f.name for f in fields(self)):
@@ -46,6 +50,9 @@ class Camera:
                 raise SlamError(f"camera.{name} = {getattr(self, name):g}: the principal point is outside the image (0 to {size})")
         if not 1.0 <= self.depth_scale <= 1e6:
             raise SlamError(f"camera.depth_scale = {self.depth_scale:g}: must be depth units per metre, such as 5000 or 1000")
+        if not abs(self.inverse_depth_offset) <= MAX_INVERSE_DEPTH_OFFSET:
+            limit = f"{MAX_INVERSE_DEPTH_OFFSET:g} 1/m at most either way"
+            raise SlamError(f"camera.inverse_depth_offset = {self.inverse_depth_offset:g}: must be {limit}")
 
     @property
     def K(self) -> np.ndarray:
@@ -62,6 +69,28 @@ class Camera:
         """Give per raw pixel the undistorted (x/z, y/z), (height, width, 2) float32: a pixel's point is depth * (x/z, y/z, 1)."""
         u, v = np.meshgrid(np.arange(self.width, dtype=np.float64), np.arange(self.height, dtype=np.float64))
         return self.normalise(np.stack([u.ravel(), v.ravel()], axis=1)).reshape(self.height, self.width, 2).astype(np.float32)
+
+    @cached_property
+    def metres(self) -> np.ndarray:
+        """Give the depth (65536,) float32 [m] of every possible reading, NaN where there is none: one look-up converts and masks."""
+        read = np.arange(DEPTH_VALUES, dtype=np.float32) / np.float32(self.depth_scale)
+        read[0] = np.nan
+        return self._from_read(read)
+
+    def reread(self, depth: np.ndarray, given: "Camera") -> np.ndarray:
+        """Give depth (...) [m], read under the calibration `given`, as it is under this one."""
+        if (self.depth_scale, self.inverse_depth_offset) == (given.depth_scale, given.inverse_depth_offset):
+            return depth
+        with np.errstate(divide="ignore"):
+            read = 1.0 / (1.0 / depth - given.inverse_depth_offset)
+        return self._from_read(read * (given.depth_scale / self.depth_scale)).astype(depth.dtype)
+
+    def _from_read(self, read: np.ndarray) -> np.ndarray:
+        if self.inverse_depth_offset == 0.0:
+            return read
+        with np.errstate(divide="ignore"):
+            inverse = 1.0 / read + self.inverse_depth_offset
+        return np.where(inverse > 0.0, 1.0 / np.maximum(inverse, np.finfo(np.float32).tiny), np.nan).astype(read.dtype)
 
     def project(self, x_c: np.ndarray) -> np.ndarray:
         """Project points (..., 3) in front of the camera to undistorted pixels (..., 2)."""

@@ -9,6 +9,7 @@ import numpy as np
 
 from slamcli.datasets import Dataset
 from slamcli.errors import BadFrame
+from slamcli.geometry.camera import DEPTH_VALUES
 from slamcli.parallel import ordered_map
 
 THUMBNAIL = (32, 24)  # px, width and height of the small pictures that are compared with one another
@@ -17,7 +18,6 @@ FAST_THRESHOLD = 20  # grey levels
 BLUR_SPAN = 9 / 640  # of the picture's width; of the filter that blur is judged with
 LINE_STEP = 4  # every fourth row and column is enough to judge a whole picture
 DEPTH_STEP = 4  # likewise for depth readings
-DEPTH_VALUES = 1 << 16
 STRANGER = 1.7  # times the difference between its neighbours: in an even motion the ratio is 0.5
 SWAPPED = 0.75  # of the difference as listed: in an even motion the ratio is 2, after a swap 0.5
 JUMP = 5.0  # times the largest difference nearby

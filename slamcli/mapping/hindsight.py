@@ -38,6 +38,7 @@ def look_again(
     """
     if shape_edges:
         T_cd = timing.depth_to_colour(builder.features, sensing.timing, builder.kf.frame)
+        reliefs = reliefs.under(sensing.camera)
         Shape(builder, reliefs, reliefs).join_covisible(T_cd, most=shape_edges, least=SHARED)
     kfs = np.arange(len(builder.kf), dtype=np.int32)
     result = adjustment.adjust(builder, kfs, sensing.camera, sensor, max_iterations=iterations)

@@ -7,7 +7,8 @@ of key frames and landmarks and C = J_map^T w J, eliminating the map leaves
 
 which is small, and whose inverse is the covariance of g.
 
-A factor on all depth readings is no such number: a world, a path and depths that are all stretched alike show the same pictures.
+A factor on all depth readings stays as it is believed to be: a world, a path and depths that are all stretched alike show the same
+pictures. An offset of inverse depth, as of a sensor whose disparities are off by a constant, bends the world and is found.
 """
 
 from dataclasses import dataclass, replace
@@ -51,6 +52,8 @@ def unknowns(camera: Camera, option: OptimizeConfig) -> dict[str, float]:
     if option.intrinsics:
         prior |= {"fx": option.focal_prior * camera.fx, "fy": option.focal_prior * camera.fy}
         prior |= {"cx": option.centre_prior, "cy": option.centre_prior}
+    if option.depth_scale:
+        prior |= {"depth_scale": option.depth_scale_prior * camera.depth_scale, "inverse_depth_offset": option.inverse_depth_prior}
     return prior
 
 
@@ -67,7 +70,7 @@ def recalibrate(features: Features, given: Camera, camera: Camera) -> Features:
     for start in range(0, len(xy), timing.ROWS_AT_ONCE):
         part = slice(start, start + timing.ROWS_AT_ONCE)
         xy[part] = camera.undistort(given.distort(features.xy[part]))
-    return replace(features, xy=xy)
+    return replace(features, xy=xy, depth=camera.reread(features.depth, given))
 
 
 def estimate_sensing(builder: MapBuilder, given: Camera, now: Sensing, sensor: SensorConfig, *, prior: dict[str, float]) -> Sensing | None:
@@ -83,9 +86,11 @@ def estimate_sensing(builder: MapBuilder, given: Camera, now: Sensing, sensor: S
     problem = bundle.Problem(T_kw, x_w, *part.arguments, now.camera, part.is_fixed, part.edges)
     names = list(prior)
     predicted = problem.in_given_order(residuals(problem, problem.T, problem.x) + problem.measured[:, :3])
-    columns = np.stack([_column(name, builder.features, part.row, predicted, now, prior[name]) for name in names], axis=2)
+    # What an offset bends is to turn about readings of this depth, so that it changes no size that the depth scale answers for.
+    pivot = float(np.median(predicted[:, 2]))
+    columns = np.stack([_column(name, builder.features, part.row, predicted, now, prior[name], pivot) for name in names], axis=2)
     value, centre = (
-        np.array([_number(name, camera, when) for name in names]) for camera, when in ((now.camera, now.timing), (given, None))
+        np.array([_number(name, camera, when, pivot) for name in names]) for camera, when in ((now.camera, now.timing), (given, None))
     )
     found = estimate(problem, problem.T, problem.x, columns, prior=centre - value, prior_sigma=np.array(list(prior.values())))
     if found is None:
@@ -94,22 +99,27 @@ def estimate_sensing(builder: MapBuilder, given: Camera, now: Sensing, sensor: S
     # What cannot be told from what was believed stays so: the noise of its estimate would go into all measurements for nothing.
     value = np.where(np.abs(value - centre) > SIGNIFICANT * found.sigma, value, centre)
     better = dict(zip(names, value.tolist(), strict=True))
+    if "depth_scale" in better:
+        better["depth_scale"] *= 1.0 - better["inverse_depth_offset"] * pivot
     when = {name: np.array(better.pop(name)) for name in ("readout", "depth_delay") if name in better}
     return Sensing(replace(now.camera, **better), replace(now.timing, **when), dict(zip(names, found.sigma.tolist(), strict=True)))
 
 
-def _number(name: str, camera: Camera, when: Timing | None) -> float:
-    """Look up an unknown; without timing, what is believed of it before looking."""
+def _number(name: str, camera: Camera, when: Timing | None, pivot: float) -> float:
+    """Look up an unknown; without timing, what is believed of it before looking. The depth scale is that of readings at depth `pivot` [m]."""
+    if name == "depth_scale":
+        return camera.depth_scale / (1.0 - camera.inverse_depth_offset * pivot)
     if hasattr(camera, name):
         return float(getattr(camera, name))
     return 0.0 if when is None else float(getattr(when, name))
 
 
-def _column(name: str, features: Features, rows: np.ndarray, predicted: np.ndarray, now: Sensing, sigma: float) -> np.ndarray:
+def _column(name: str, features: Features, rows: np.ndarray, predicted: np.ndarray, now: Sensing, sigma: float, pivot: float) -> np.ndarray:
     """Give by how much the measurements `rows` (O,) grow per unit of an unknown, (O, 3) [px, px, m].
 
     predicted : (O, 3) [px, px, m] where the map says they should be. Readings themselves would not do for what stretches them: it
     stretches their errors too, and the least errors are those of the smallest camera.
+    pivot : [m] depth of readings that the offset of inverse depth leaves as they are
     """
     column = np.zeros((len(rows), 3))
     if name in ("readout", "depth_delay"):
@@ -118,6 +128,15 @@ def _column(name: str, features: Features, rows: np.ndarray, predicted: np.ndarr
             column[:, :2] = -px_per_s * share[:, None]
         else:
             column[:, 2] = -depth_per_s
+        return column
+    if name in ("depth_scale", "inverse_depth_offset"):
+        z, offset = predicted[:, 2], now.camera.inverse_depth_offset
+        read = 1.0 / z - offset  # [1/m] inverse of the readings, before the offset
+        per_inverse = -z * z
+        if name == "depth_scale":
+            column[:, 2] = per_inverse * read / _number(name, now.camera, None, pivot)
+        else:
+            column[:, 2] = per_inverse * (1.0 - read * pivot / (1.0 - offset * pivot))
         return column
     # As the focal length changes, predictions move as well: what counts is where the ray points, in pixels of the camera of now.
     raw, step = now.camera.distort(predicted[:, :2]), STEP * sigma

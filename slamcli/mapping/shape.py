@@ -27,9 +27,14 @@ JOIN_MOST = 5  # edges of a new key frame to earlier ones: more of them hold dow
 class Reliefs:
     """The reliefs of a recording's frames; those used last are kept."""
 
-    def __init__(self, depth: CoarseDepth, camera: Camera, sensor: SensorConfig) -> None:
-        self._depth, self._camera, self._sensor = depth.coarse_depth, camera, sensor
+    def __init__(self, depth: CoarseDepth, given: Camera, sensor: SensorConfig, *, camera: Camera | None = None) -> None:
+        """Take the coarse depth images, read under the calibration `given`; camera : what is known of the camera, if more."""
+        self._depth, self._given, self._camera, self._sensor = depth, given, camera or given, sensor
         self._kept: OrderedDict[int, Relief | None] = OrderedDict()
+
+    def under(self, camera: Camera) -> "Reliefs":
+        """Give the reliefs as they are under another calibration of the same camera."""
+        return self if camera == self._camera else Reliefs(self._depth, self._given, self._sensor, camera=camera)
 
     def of(self, frame: int) -> Relief | None:
         """Give the relief of a frame, None where it shows too little."""
@@ -42,9 +47,10 @@ class Reliefs:
         return found
 
     def _make(self, frame: int) -> Relief | None:
-        if not 0 <= frame < len(self._depth) or not self._depth[frame].any():
+        images = self._depth.coarse_depth
+        if not 0 <= frame < len(images) or not images[frame].any():
             return None
-        relief = surface.relief(self._depth[frame], self._camera, self._sensor)
+        relief = surface.relief(images[frame], self._camera, self._sensor, given=self._given)
         return relief if len(relief) >= LEAST_POINTS * relief.row.size else None
 
 
@@ -56,6 +62,10 @@ class NoReliefs(Reliefs):
 
     def of(self, frame: int) -> None:
         """Give no relief."""
+
+    def under(self, camera: Camera) -> "NoReliefs":
+        """Give these."""
+        return self
 
 
 @dataclass(frozen=True)

@@ -86,10 +86,13 @@ def coarse_shape(camera: Camera) -> tuple[int, int]:
     return camera.height // side, camera.width // side
 
 
-def relief(coarse_depth: np.ndarray, camera: Camera, sensor: SensorConfig) -> Relief:
-    """Find the surface in a coarse depth image of `camera`."""
+def relief(coarse_depth: np.ndarray, camera: Camera, sensor: SensorConfig, *, given: Camera | None = None) -> Relief:
+    """Find the surface in a coarse depth image of `camera`.
+
+    given : the calibration under which the depth was read, if it was another one
+    """
     small, row_at = _coarse_camera(camera)
-    depth = coarse_depth.astype(np.float32) * np.float32(UNIT)
+    depth = camera.reread(coarse_depth.astype(np.float32) * np.float32(UNIT), given or camera)
     seen = fusion.surface(depth, small, settings=CLEANING, stride=1, spacing=0.0, depth_min=sensor.depth_min, depth_max=sensor.depth_max)
     row = np.full(depth.size + 1, -1, dtype=np.int32)
     row[seen.pixel] = np.arange(len(seen.pixel), dtype=np.int32)

@@ -109,7 +109,7 @@ def views(
     def view(item: tuple[int, np.ndarray]) -> View | None:
         frame, T_wk = item
         try:
-            depth = dataset.depth(frame)
+            depth = dataset.depth(frame, camera)
             if depth is None:
                 return None
             seen = fusion.surface(

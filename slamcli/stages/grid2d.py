@@ -38,7 +38,8 @@ def run(inputs: Any, out: Path, cfg: Any, tools: Any) -> dict:
 
 
 def _from_depth(inputs: Any, T_lw: np.ndarray, cfg: Any, tools: Any) -> tuple[Grid, int]:
-    option, rays = cfg.grid2d, np.ascontiguousarray(inputs.camera("loop").rays)
+    option, camera = cfg.grid2d, inputs.camera("loop")
+    rays = np.ascontiguousarray(camera.rays)
     has_depth = np.isfinite(inputs.load(Features, "extract").depth_stamp)
     poses = [(frame, T_lw @ T_wd) for frame, T_wd in depth_poses(inputs, frames="all") if has_depth[frame]]
     chosen = grid.spaced(np.array([T_ld for _, T_ld in poses]).reshape(-1, 4, 4), metres=option.spacing, degrees=option.spacing_deg)
@@ -46,7 +47,7 @@ def _from_depth(inputs: Any, T_lw: np.ndarray, cfg: Any, tools: Any) -> tuple[Gr
     def view(row: int) -> View | None:
         frame, T_ld = poses[row]
         try:
-            depth = inputs.dataset.depth(frame)
+            depth = inputs.dataset.depth(frame, camera)
         except BadFrame as error:
             tools.warn(str(error))
             return None

@@ -83,7 +83,7 @@ def scans(
     def scan(item: tuple[int, np.ndarray]) -> Scan | None:
         frame, T_lk = item
         try:
-            depth = dataset.depth(frame)
+            depth = dataset.depth(frame, camera)
         except BadFrame as error:
             warn(str(error))
             return None

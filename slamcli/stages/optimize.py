@@ -77,5 +77,5 @@ def told(sensing: Sensing) -> dict:
         is_time = name in ("readout", "depth_delay")
         unit = 1e3 if is_time else 1.0
         value = getattr(sensing.timing if is_time else sensing.camera, name)
-        figures[f"{name}_ms" if is_time else name] = [round(unit * float(value), 3), round(unit * sigma, 3)]
+        figures[f"{name}_ms" if is_time else name] = [float(f"{unit * one:.6g}") for one in (float(value), sigma)]
     return figures
