@@ -47,6 +47,15 @@ class CoarseDepth:
 
 
 @dataclass(frozen=True)
+class Flow:
+    """Where key points went by optical flow, by extract where it is asked for."""
+
+    flow_xy: np.ndarray = array(
+        "f4", "M 2", "px, undistorted, of each feature in the frame that follows its own, NaN = lost", may_lack=True
+    )
+
+
+@dataclass(frozen=True)
 class Words:
     """The visual words of every feature and the word vector of every frame, by match."""
 

@@ -14,7 +14,7 @@ from slamcli.config import Config, ExtractConfig, MatchConfig
 from slamcli.datasets import open_dataset
 from slamcli.errors import SlamError
 from slamcli.geometry.camera import Camera
-from slamcli.schema import Features, Matches, Words
+from slamcli.schema import Features, Flow, Matches, Words
 from slamcli.stages import extract, match
 from slamcli.vision import hamming, orb
 
@@ -40,9 +40,9 @@ def run_extract(recording: Path, out: Path, workers: int = 2, **options) -> tupl
     return artifacts.load(Features, out), summary, tools.warnings
 
 
-def run_match(features: Features, out: Path, **options) -> tuple[Words, Matches, dict]:
+def run_match(features: Features, out: Path, *, flow: Flow = Flow(), **options) -> tuple[Words, Matches, dict]:  # noqa: B008
     out.mkdir()
-    inputs = SimpleNamespace(load=lambda cls, stage: features)
+    inputs = SimpleNamespace(load=lambda cls, stage: {Features: features, Flow: flow}[cls])
     summary = match.run(inputs, out, SimpleNamespace(match=MatchConfig(**options), seed=0), Tools())
     return artifacts.load(Words, out), artifacts.load(Matches, out), summary
 
@@ -202,3 +202,23 @@ def test_words_find_nearly_what_brute_force_finds(features: Features, tmp_path: 
     i, j = (slice(features.offset[f], features.offset[f + 1]) for f in brute.pair[4])
     rows, _ = hamming.match_brute(features.desc[i], features.desc[j], features.angle[i], features.angle[j])
     np.testing.assert_array_equal(rows, brute.row[brute.offset[4] : brute.offset[5]])
+
+
+def test_flow_adds_matches_only_where_descriptors_give_few(room: Path, tmp_path: Path) -> None:
+    features, _, _ = run_extract(room, tmp_path / "extract", features=200, flow=True)
+    flow = artifacts.load(Flow, tmp_path / "extract")
+    assert flow.flow_xy.shape == features.xy.shape and 0.5 < np.isfinite(flow.flow_xy[: features.offset[-2], 0]).mean() < 1.0
+    assert np.isnan(flow.flow_xy[features.offset[-2] :]).all()  # no frame follows the last
+    plain, never, always = (
+        run_match(features, tmp_path / name, flow=given, flow_below=below)[1]
+        for name, given, below in (("plain", Flow(), 1000), ("never", flow, 0), ("always", flow, 1000))
+    )
+    assert plain.row.tobytes() == never.row.tobytes() and len(always.row) > 1.1 * len(plain.row)
+    for p, (i, j) in enumerate(always.pair):
+        rows = always.row[always.offset[p] : always.offset[p + 1]]
+        before = plain.row[plain.offset[p] : plain.offset[p + 1]]
+        np.testing.assert_array_equal(rows[: len(before)], before)
+        assert len(np.unique(rows[:, 0])) == len(rows) == len(np.unique(rows[:, 1]))
+        more = rows[len(before) :]
+        ends = flow.flow_xy[features.offset[j] + more[:, 1]] - features.xy[features.offset[i] + more[:, 0]]
+        assert (np.linalg.norm(ends, axis=1) <= 2.0).all()

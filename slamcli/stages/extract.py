@@ -14,8 +14,8 @@ from slamcli.errors import BadFrame, SlamError
 from slamcli.geometry.camera import Camera
 from slamcli.mapping import surface
 from slamcli.parallel import ordered_map
-from slamcli.schema import CoarseDepth, Features
-from slamcli.vision import orb
+from slamcli.schema import CoarseDepth, Features, Flow
+from slamcli.vision import flow, orb
 
 USUAL_WIDTH = 640  # px
 JUMP_REACH = 3  # px to either side of a key point where a jump of depth is looked for: as far as FAST looks
@@ -49,6 +49,7 @@ def run(inputs, out: Path, cfg, tools) -> dict:
     features = _table(dataset, camera, found, cfg.extract.scale)
     artifacts.save(features, out)
     artifacts.save(_coarse_table(camera, found), out)
+    artifacts.save(_flow_table(dataset, camera, found, tools) if cfg.extract.flow else Flow(), out)
     _write_association(out / "frames.txt", dataset, features.depth_stamp)
     write_camera(out, camera)
     n = np.diff(features.offset)
@@ -163,6 +164,22 @@ def _coarse_table(camera: Camera, found: list[_Frame]) -> CoarseDepth:
         if frame.coarse is not None:
             coarse[i] = frame.coarse
     return CoarseDepth(coarse_depth=coarse)
+
+
+def _flow_table(dataset: Dataset, camera: Camera, found: list[_Frame], tools) -> Flow:
+    """Follow the key points of every frame into the next one."""
+
+    def follow(i: int) -> np.ndarray:
+        xy, n = found[i].points.xy, len(found)
+        if i + 1 == n or len(xy) == 0 or len(found[i + 1].points) == 0:
+            return np.full((len(xy), 2), np.nan, np.float32)
+        return flow.follow(dataset.grey(i), dataset.grey(i + 1), xy)
+
+    followed = ordered_map(follow, range(len(found)), workers=tools.workers)
+    raw = np.concatenate(list(tools.progress(followed, "flow", len(found))))
+    is_found = np.isfinite(raw[:, 0])
+    raw[is_found] = camera.undistort(raw[is_found])
+    return Flow(flow_xy=raw)
 
 
 def _write_association(path: Path, dataset: Dataset, depth_stamp: np.ndarray) -> None:

@@ -8,8 +8,8 @@ import numpy as np
 from slamcli import artifacts
 from slamcli.config import MatchConfig
 from slamcli.parallel import ordered_map
-from slamcli.schema import Features, Matches, Words
-from slamcli.vision import hamming, vocabulary
+from slamcli.schema import Features, Flow, Matches, Words
+from slamcli.vision import flow, hamming, vocabulary
 
 
 def run(inputs, out: Path, cfg, tools) -> dict:
@@ -17,7 +17,9 @@ def run(inputs, out: Path, cfg, tools) -> dict:
     features, settings = inputs.load(Features, "extract"), cfg.match
     words = _words(features, vocabulary.load(settings.vocabulary), settings)
     pairs = [(i, j) for i in range(len(features.stamp)) for j in range(max(0, i - settings.window), i)]
-    found = list(tools.progress(ordered_map(partial(_match, features, words, settings), pairs, workers=tools.workers), "match", len(pairs)))
+    flowed = inputs.load(Flow, "extract").flow_xy
+    match = partial(_match, features, words, flowed, settings)
+    found = list(tools.progress(ordered_map(match, pairs, workers=tools.workers), "match", len(pairs)))
     matches = Matches(
         pair=np.array(pairs, dtype=np.int32).reshape(-1, 2),
         offset=np.cumsum([0] + [len(rows) for rows, _ in found], dtype=np.int64),
@@ -41,7 +43,21 @@ def _words(features: Features, words: vocabulary.Vocabulary, settings: MatchConf
     return Words(idf=words.idf, word=word, node=node, bow_offset=bow_offset, bow_word=bow_word, bow_weight=bow_weight)
 
 
-def _match(features: Features, words: Words, settings: MatchConfig, pair: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+def _match(
+    features: Features, words: Words, flowed: np.ndarray, settings: MatchConfig, pair: tuple[int, int]
+) -> tuple[np.ndarray, np.ndarray]:
+    rows, distance = _match_descriptors(features, words, settings, pair)
+    if len(flowed) == 0 or len(rows) >= settings.flow_below or pair[0] - pair[1] != 1:
+        return rows, distance
+    i, j = (slice(int(features.offset[frame]), int(features.offset[frame + 1])) for frame in pair)
+    is_free_i, is_free_j = np.ones(i.stop - i.start, dtype=bool), np.ones(j.stop - j.start, dtype=bool)
+    is_free_i[rows[:, 0]] = is_free_j[rows[:, 1]] = False
+    more = flow.match(features.xy[i], flowed[j], is_free_i=is_free_i, is_free_j=is_free_j, radius=settings.flow_radius)
+    bits = np.unpackbits(features.desc[i][more[:, 0]] ^ features.desc[j][more[:, 1]], axis=1).sum(axis=1)
+    return np.concatenate([rows, more]), np.concatenate([distance, bits.clip(0, 255).astype(np.uint8)])
+
+
+def _match_descriptors(features: Features, words: Words, settings: MatchConfig, pair: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
     i, j = (slice(int(features.offset[frame]), int(features.offset[frame + 1])) for frame in pair)
     checks = {"max_distance": settings.max_distance, "ratio": settings.ratio, "check_rotation": settings.check_rotation}
     if settings.method == "brute":
