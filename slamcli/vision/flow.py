@@ -9,7 +9,7 @@ import numpy as np
 
 WINDOW = (15, 15)  # px
 LEVELS = 4  # above the image itself, each half as large: motions of some hundred pixels
-RETURN_PX = 1.0  # from which a point must start to come back to where it was
+RETURN_PX = 1.0  # from its start, within which a point that is followed back must arrive
 
 
 def follow(grey: np.ndarray, following: np.ndarray, xy: np.ndarray) -> np.ndarray:
