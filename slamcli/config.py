@@ -226,7 +226,7 @@ class LoopConfig:
     join_closures: int = option(2, "closures that must agree on how two map segments lie before these are joined", ge=1)
     main_segment: int = option(0, "map segment the maps are made of, where some could not be joined: 0 = the largest", ge=0)
     hindsight: bool = option(
-        True, "once loops are closed, align depth images of key frames again and match every frame again against the final map"
+        True, "once loops are closed, align depth images of key frames again, and match every other frame again against the final map"
     )
     shape_edges: int = option(
         6,

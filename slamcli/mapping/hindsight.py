@@ -1,4 +1,4 @@
-"""The second look: the depth images of key frames and then every frame meet the final map again. Only a batch program can do this."""
+"""The second look: key frames by their depth images, then all other frames, meet the final map again. Only a batch program can do this."""
 
 import numpy as np
 
@@ -30,7 +30,7 @@ def look_again(
     iterations: int,
     progress,
 ) -> tuple[Tracks, BundleResult | None]:
-    """Align each key frame's depth image with those of up to `shape_edges` covisible ones, adjust the map, refine every frame against it.
+    """Align each key frame's depth image with those of up to `shape_edges` covisible ones, adjust the map, refine the others against it.
 
     builder : its map is changed; its features are those that `sensing` corrected
     reliefs : of the recording, of which depth images are taken

@@ -1,4 +1,4 @@
-"""loop: places seen again are joined, the whole map is adjusted, and every key frame and frame meets it once more."""
+"""loop: places seen again are joined, the whole map is adjusted, and all frames meet it once more."""
 
 import csv
 import itertools
