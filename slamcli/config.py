@@ -226,13 +226,19 @@ class LoopConfig:
     join_closures: int = option(2, "closures that must agree on how two map segments lie before these are joined", ge=1)
     main_segment: int = option(0, "map segment the maps are made of, where some could not be joined: 0 = the largest", ge=0)
     hindsight: bool = option(
-        True, "once loops are closed, align depth images of key frames again, and match every other frame again against the final map"
+        True, "once loops are closed, match every frame again against the final map, key frames by their depth images too"
     )
     shape_edges: int = option(
         6,
         "earlier key frames that each one's depth image is aligned with then, besides the landmarks that both see; 0 = none: 3 to 17 % more APE in simulated rooms, 0.5 % less on fr1_xyz",
         ge=0,
         le=50,
+    )
+    shape_weight: float = option(
+        2.0,
+        "how much those count in the last adjustment against what they count in optimize; 1: 5 to 20 % more APE in simulated rooms, 1 % less on fr1_xyz",
+        gt=0,
+        le=100,
     )
 
 

@@ -1,5 +1,7 @@
 """Loops: true revisits are found and pull drift out, look-alikes and unverifiable ones are rejected with a reason; hindsight."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scenes import CAMERA, ape, observe, orbit, room_points
@@ -112,13 +114,50 @@ def test_rejected_candidates_say_why(turn):
 
 def test_hindsight_finds_lost_frames_and_keeps_the_rest(turn):
     scene, tracks, map_ = turn
-    tracks.state[40:44], tracks.ref_kf[40:44] = LOST, -1
-    tracks.T_kc[40:44] = np.nan
+    tracks = replace(tracks, **{name: getattr(tracks, name).copy() for name in ("state", "ref_kf", "T_kc")})
+    tracks.state[40:44], tracks.ref_kf[40:44], tracks.T_kc[40:44] = LOST, -1, np.nan
     builder = MapBuilder.from_map(scene.features, map_)
     after = hindsight.refine_frames(builder, scene.features, tracks, CAMERA, SENSOR, TrackConfig(), lambda items, label: items)
     assert (after.state != LOST).all()
     error = [ape(frame_poses(t, map_), scene.T_gc) for t in (tracks, after)]
     assert 1e-4 < error[1] < error[0] + 0.001
+
+
+def test_hindsight_matches_key_frames_again_and_the_world_stays_where_it_is(turn):
+    scene, tracks, map_ = turn
+    builder = MapBuilder.from_map(scene.features, map_)
+    rng = np.random.default_rng(5)
+    noise = se3.exp(rng.normal(0, [0.01, 0.01, 0.01, 0.004, 0.004, 0.004], (len(builder.kf), 6)))
+    noise[0] = np.eye(4)
+    builder.kf.T_wk[:] = builder.kf.T_wk @ noise
+    shaken = builder.kf.T_wk.copy()
+    found = hindsight.refine_frames(builder, scene.features, tracks, CAMERA, SENSOR, TrackConfig(), lambda items, label: items)
+    assert (builder.kf.T_wk == shaken).all(), "to refine frames leaves the map as it is"
+    seen, landmarks = frame_poses(found, builder.snapshot()), builder.snapshot().lm_xyz
+    after = hindsight.move_key_frames(builder, found)
+    moved = builder.snapshot()
+    assert (after.T_kc[moved.kf_frame] == np.eye(4)).all()
+    assert np.abs(builder.kf.T_wk[0] - shaken[0]).max() < 1e-12
+    shift = shaken[0] @ se3.inverse(seen[moved.kf_frame[0]])
+    assert np.nanmax(np.abs(frame_poses(after, moved) - shift @ seen)) < 1e-12
+    assert np.abs(moved.lm_xyz - se3.transform(shift, landmarks)).max() < 1e-5
+    error = [ape(T_wk, map_.T_wk) for T_wk in (shaken, moved.T_wk)]  # of what landmarks hold, which drift does not touch
+    assert error[0] > 0.01 and 1e-5 < error[1] < 0.2 * error[0]
+
+
+def test_a_key_frame_that_shape_held_keeps_its_pose(turn):
+    scene, tracks, map_ = turn
+    most = int(tracks.n_inliers.max())
+    found = [
+        hindsight.refine_frames(
+            MapBuilder.from_map(scene.features, map_), scene.features, tracks, CAMERA, SENSOR, replace(TrackConfig(), shape_below=least),
+            lambda items, label: items,
+        )
+        for least in (10 * most, 0)
+    ]  # fmt: skip
+    is_kept = [(f.T_kc[map_.kf_frame] == tracks.T_kc[map_.kf_frame]).all(axis=(1, 2)) for f in found]
+    assert is_kept[0].all() and not is_kept[1].all()
+    assert (found[0].T_kc != tracks.T_kc).any(), "other frames are refined all the same"
 
 
 def test_views_of_one_spot_are_found_by_their_poses(turn):

@@ -1,6 +1,6 @@
 """Bundle adjustment of a part of the growing map, or of all of it."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -75,10 +75,11 @@ def gather(builder: MapBuilder, moving: np.ndarray, sensor: SensorConfig) -> Par
 
 
 def adjust(
-    builder: MapBuilder, moving: np.ndarray, camera: Camera, sensor: SensorConfig, *, max_iterations: int
+    builder: MapBuilder, moving: np.ndarray, camera: Camera, sensor: SensorConfig, *, max_iterations: int, edge_weight: float = 1.0
 ) -> bundle.BundleResult | None:
     """Adjust the key frames `moving` and all they see, in place, and remove the observations found to be outliers.
 
+    edge_weight : factor on the information of edges between key frames
     Returns the evidence, or None where nothing ties two key frames together.
     """
     part = gather(builder, moving, sensor)
@@ -90,7 +91,7 @@ def adjust(
         *part.arguments,
         camera,
         is_fixed=part.is_fixed,
-        edges=part.edges,
+        edges=replace(part.edges, information=edge_weight * part.edges.information),
         max_iterations=max_iterations,
     )
     before = builder.kf.T_wk[part.kfs].copy()

@@ -1,4 +1,6 @@
-"""The second look: key frames by their depth images, then all other frames, meet the final map again. Only a batch program can do this."""
+"""The second look: key frames by their depth images, then every frame by landmarks, meet the final map again. Only a batch program can."""
+
+from dataclasses import replace
 
 import numpy as np
 
@@ -27,13 +29,14 @@ def look_again(
     *,
     reliefs: Reliefs,
     shape_edges: int,
+    shape_weight: float = 1.0,
     iterations: int,
     progress,
 ) -> tuple[Tracks, BundleResult | None]:
-    """Align each key frame's depth image with those of up to `shape_edges` covisible ones, adjust the map, refine the others against it.
+    """Align each key frame's depth image with those of up to `shape_edges` covisible ones, adjust the map, refine every frame against it.
 
     builder : its map is changed; its features are those that `sensing` corrected
-    reliefs : of the recording, of which depth images are taken
+    reliefs : of the recording, of which depth images are taken; shape_weight : factor on what they say in the adjustment
     Returns the refined tracks, and the evidence of the adjustment, None where nothing ties two key frames together.
     """
     if shape_edges:
@@ -41,23 +44,47 @@ def look_again(
         reliefs = reliefs.under(sensing.camera)
         Shape(builder, reliefs, reliefs).join_covisible(T_cd, most=shape_edges, least=SHARED)
     kfs = np.arange(len(builder.kf), dtype=np.int32)
-    result = adjustment.adjust(builder, kfs, sensing.camera, sensor, max_iterations=iterations)
-    return refine_frames(builder, builder.features, tracks, sensing.camera, sensor, settings, progress), result
+    result = adjustment.adjust(builder, kfs, sensing.camera, sensor, max_iterations=iterations, edge_weight=shape_weight)
+    tracks = refine_frames(builder, builder.features, tracks, sensing.camera, sensor, settings, progress)
+    return move_key_frames(builder, tracks), result
+
+
+def move_key_frames(builder: MapBuilder, tracks: Tracks) -> Tracks:
+    """Move each key frame to where its frame stands, landmarks staying, and hang all frames on the key frames again.
+
+    The oldest key frame of each segment is its world's origin: instead of it, all else moves.
+    """
+    table, has_pose = builder.kf, tracks.ref_kf >= 0
+    ref, T_wc = tracks.ref_kf[has_pose], np.full(tracks.T_kc.shape, np.nan)
+    T_wc[has_pose] = table.T_wk[ref] @ tracks.T_kc[has_pose]
+    for oldest in np.unique(table.segment, return_index=True)[1]:
+        shift = table.T_wk[oldest] @ se3.inverse(T_wc[table.frame[oldest]])
+        is_here = table.segment == table.segment[oldest]
+        frames = np.flatnonzero(has_pose)[is_here[ref]]
+        T_wc[frames] = shift @ T_wc[frames]
+        ids = np.flatnonzero(builder.lm.is_alive & is_here[builder.lm.first_kf])
+        builder.lm.xyz[ids] = se3.transform(shift, builder.lm.xyz[ids])
+    table.T_wk[:] = T_wc[table.frame]
+    T_kc = np.full(T_wc.shape, np.nan)
+    T_kc[has_pose] = se3.inverse(table.T_wk[ref]) @ T_wc[has_pose]
+    T_kc[table.frame] = np.eye(4)
+    return replace(tracks, T_kc=T_kc)
 
 
 def refine_frames(
     builder: MapBuilder, features: Features, tracks: Tracks, camera: Camera, sensor: SensorConfig, settings: TrackConfig, progress
 ) -> Tracks:
-    """Refine every frame that is no key frame against the landmarks around it; lost ones are tried from both sides.
+    """Refine every frame against the landmarks around it; lost ones are tried from both sides.
 
     features, tracks : of the frames, which may be of another recording than the map
-    A frame keeps its pose where much fewer landmarks agree than before. Returns new Tracks.
+    A frame keeps its pose where much fewer landmarks agree than before, and a key frame also where so few do that shape held it.
+    Returns new Tracks; the map stays as it is.
     """
     look = _Look(builder, features, tracks, camera, sensor, settings)
     n = len(tracks.state)
     for i in progress(range(n), "hindsight"):
-        if tracks.state[i] not in (LOST, KEY_FRAME, ON_SHAPE):  # the few landmarks around a frame on shape would make its pose worse
-            look.at(i, look.T_wc[i], int(tracks.ref_kf[i]))
+        if tracks.state[i] not in (LOST, ON_SHAPE):  # the few landmarks around a frame on shape would make its pose worse
+            look.at(i, look.T_wc[i], int(tracks.ref_kf[i]), least=settings.shape_below if tracks.state[i] == KEY_FRAME else 0)
     for order, step in ((range(n), -1), (range(n - 1, -1, -1), 1)):
         for i in order:  # a lost frame begins where its neighbour in time stands
             j = i + step
@@ -82,12 +109,12 @@ class _Look:
         self.state, self.n_inliers = tracks.state.copy(), tracks.n_inliers.copy()
         self._around: dict[int, tuple] = {}
 
-    def at(self, i: int, T_wc: np.ndarray, kf: int, *, widening: float = 1.0) -> bool:
+    def at(self, i: int, T_wc: np.ndarray, kf: int, *, widening: float = 1.0, least: int = 0) -> bool:
         """Look for frame `i` at `T_wc` among the landmarks around key frame `kf`; False, and nothing changes, if it is not there.
 
-        widening : of the search window, where `T_wc` is a guess
+        widening : of the search window, where `T_wc` is a guess; least : landmarks that must agree whatever the settings say
         """
-        wanted = max(self.settings.min_inliers, int(self.n_inliers[i]) // 2)
+        wanted = max(least, self.settings.min_inliers, int(self.n_inliers[i]) // 2)
         frame, candidates = frame_features(self.features, i, self.camera, self.sensor), self._landmarks_around(kf)
         feature, _ = projection.search(
             se3.inverse(T_wc),

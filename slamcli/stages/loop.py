@@ -38,6 +38,7 @@ def run(inputs, out: Path, cfg, tools) -> dict:
             cfg.track,
             reliefs=Reliefs(inputs.load(CoarseDepth, "extract"), given, cfg.sensor),
             shape_edges=cfg.loop.shape_edges,
+            shape_weight=cfg.loop.shape_weight,
             iterations=cfg.loop.iterations,
             progress=tools.progress,
         )
