@@ -1,11 +1,15 @@
 """Tracking on simulated landmarks, with the truth known."""
 
+from dataclasses import replace
+
 import numpy as np
 from scenes import CAMERA, ape, observe, orbit, room_points, sweep
 
 from slamcli.config import SensorConfig, TrackConfig
+from slamcli.geometry import se3
 from slamcli.mapping.tracker import Tracker
-from slamcli.schema import KEY_FRAME, LOST, frame_poses
+from slamcli.schema import KEY_FRAME, LOST, Matches, frame_poses
+from slamcli.vision import flow
 
 SENSOR = SensorConfig(pixel_noise=0.5, depth_noise_base=0.0012, depth_noise_quadratic=0.0019)  # the noise that `observe` adds
 
@@ -63,6 +67,34 @@ def test_a_jump_out_of_the_known_is_lost_not_made_up():
     tracks = tracker.tracks()
     assert (tracks.state[:20] != LOST).all() and (tracks.state[20:] == LOST).all()
     assert "agree with the map" in tracker.lost_reason[25]
+
+
+def test_optical_flow_carries_over_a_jerk_that_descriptors_and_the_motion_model_miss():
+    jerk, T_gc = 15, sweep(30)
+    T_gc[jerk:] = T_gc[jerk:] @ se3.exp(np.array([0, 0, 0, 0, 0.1, 0]))  # 50 px in one frame
+    rng = np.random.default_rng(8)
+    scene = observe(T_gc, room_points(4000, rng), rng)
+    here, there = (slice(*scene.features.offset[k : k + 2]) for k in (jerk, jerk - 1))
+    went = CAMERA.project(se3.transform(se3.inverse(T_gc[jerk]), scene.xyz[scene.landmark[there]]))
+    xy, is_free = scene.features.xy[here], np.ones(400, dtype=bool)
+    flowed = flow.match(xy, went, is_free_i=is_free, is_free_j=is_free, radius=2.0)
+    states = {}
+    for name, rows in (("flow", flowed), ("no match", np.empty((0, 2), dtype=np.int32))):
+        tracker = track(replace(scene, matches=with_rows(scene.matches, jerk, rows)), segment_after=0, relocalise_inliers=1000)
+        states[name] = tracker.tracks().state
+        lost = np.flatnonzero(states[name] == LOST)
+        assert name == "no match" or 1e-5 < ape(frame_poses(tracker.tracks(), tracker.map()), T_gc) < 0.005
+    assert len(flowed) > 150 and (states["flow"] != LOST).all()
+    assert lost[0] == jerk
+
+
+def with_rows(matches: Matches, frame: int, rows: np.ndarray) -> Matches:
+    """Give frame `frame` these matches with the one before, instead of its own."""
+    parts = [
+        rows if i == frame else matches.row[a:b] for (i, _), a, b in zip(matches.pair, matches.offset, matches.offset[1:], strict=False)
+    ]
+    offset = np.cumsum([0, *map(len, parts)])
+    return Matches(pair=matches.pair, offset=offset, row=np.concatenate(parts), distance=np.zeros(offset[-1], np.uint8))
 
 
 def turn_about_y(angle: float) -> np.ndarray:
