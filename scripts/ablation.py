@@ -29,7 +29,7 @@ from slamcli.rundir import RunDir
 
 LEVERS = {  # how each is turned, and what it is
     "extract.subpixel=false": "sub-pixel key points",
-    "extract.depth_jump=0": "no depth for key points where depth jumps",
+    "extract.depth_jump=0": "no depth for key points behind an outline",
     "extract.flow=true": "optical-flow matches where descriptors give few",
     "optimize.move_depth=false": "depth moved to the colour image's time",
     "optimize.depth_delay=false": "of that, the delay that the stamps do not show",

@@ -93,13 +93,13 @@ class ExtractConfig:
     )
     depth_jump: float = option(
         0.03,
-        "a key point has no depth where depth jumps beside it by more than this share, of an image 640 px wide: no fixed point of a surface; 0 = all have",
+        "a key point has no depth where something beside it is nearer by more than this share, in an image 640 px wide: an outline hides its surface; 0 = all have: 40 % more APE in simulated rooms, as much on real recordings",
         ge=0,
         le=1,
     )
     flow: bool = option(
         False,
-        "follow key points into the next image by optical flow too, for frames whose descriptors find few matches: at every 10th and 14th frame the same APE within 1 %, and no frame found more",
+        "follow key points into the next image by optical flow too, for frames whose descriptors find few matches: 12 to 17 % less APE at every 8th frame where a third of the pictures is blurred, the same within 1 % where none is, and no frame found more",
     )
 
 

@@ -63,7 +63,7 @@ def test_features_are_those_of_each_frame(room: Path, features: Features) -> Non
         column, row = np.rint(points.xy).astype(int).T
         depth, found = dataset.depth(i), np.isfinite(features.depth[span])
         np.testing.assert_array_equal(features.depth[span][found], depth[row, column][found])
-        is_without = np.isnan(depth[row, column]) | extract.is_at_jump(depth, points.xy, jump=Config().extract.depth_jump)
+        is_without = np.isnan(depth[row, column]) | extract.is_behind_outline(depth, points.xy, jump=Config().extract.depth_jump)
         np.testing.assert_array_equal(~found, is_without)
     assert 0.3 < np.isfinite(features.depth).mean() <= 1.0
 
@@ -97,22 +97,26 @@ def test_camera_and_association_are_written_for_other_programs(room: Path, tmp_p
         assert [float(stamp), float(depth_stamp)] == pytest.approx([dataset.stamp[i], dataset.depth_stamp[i]], abs=1e-6)
 
 
-def test_a_jump_of_depth_is_told_from_a_slope_a_fold_and_a_hole() -> None:
+def test_what_is_behind_an_outline_is_told_from_the_outline_a_slope_a_fold_and_a_hole() -> None:
     v, u = np.mgrid[:60, :640].astype(float)
     slope = 1.0 / (0.2 + 0.004 * u + 0.001 * v)  # a plane: 5 m on the left, 1.9 m on the right
     fold = 1.0 / (0.4 + 0.002 * np.abs(u - 40))
     step = np.where(u < 40, 2.0, 2.3)
     at = np.array([[x, 30.0] for x in (20.0, 36.0, 37.4, 40.0, 42.0, 43.0, 60.0)])
-    assert not extract.is_at_jump(slope, at, jump=0.05).any() and not extract.is_at_jump(fold, at, jump=0.05).any()
-    np.testing.assert_array_equal(extract.is_at_jump(step, at, jump=0.05), [False, False, True, True, True, False, False])
-    assert not extract.is_at_jump(step, at, jump=0.2).any()
+    assert not extract.is_behind_outline(slope, at, jump=0.05).any() and not extract.is_behind_outline(fold, at, jump=0.05).any()
+    np.testing.assert_array_equal(extract.is_behind_outline(step, at, jump=0.05), [False, False, False, True, True, False, False])
+    assert not extract.is_behind_outline(step, at, jump=0.2).any()
     corner = np.where((u < 40) & (v < 30), 2.0, 3.0)
-    assert extract.is_at_jump(corner, np.array([[38.0, 28.0]]), jump=0.05).all()
+    assert extract.is_behind_outline(corner, np.array([[38.0, 28.0], [41.0, 31.0], [41.0, 20.0]]), jump=0.05).tolist() == [
+        False,
+        True,
+        True,
+    ]
     step[28:33, 30:34] = np.nan
-    assert not extract.is_at_jump(step, np.array([[28.0, 30.0], [32.0, 30.0]]), jump=0.05).any()
+    assert not extract.is_behind_outline(step, np.array([[28.0, 30.0], [32.0, 30.0]]), jump=0.05).any()
 
 
-def test_key_points_at_a_jump_have_no_depth(tmp_path: Path) -> None:
+def test_key_points_behind_an_outline_have_no_depth(tmp_path: Path) -> None:
     recording = texture_recording(tmp_path / "recording", frames=1)
     (path,) = (recording / "depth").iterdir()
     image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
@@ -120,10 +124,10 @@ def test_key_points_at_a_jump_have_no_depth(tmp_path: Path) -> None:
     cv2.imwrite(str(path), image)
     all_have, _, _ = run_extract(recording, tmp_path / "all", depth_jump=0.0)
     some, _, _ = run_extract(recording, tmp_path / "some")
-    near = np.abs(all_have.xy[:, 0] - image.shape[1] // 2) < 2.0
-    far = np.abs(all_have.xy[:, 0] - image.shape[1] // 2) > 5.0
-    assert near.any() and far.any() and np.isfinite(all_have.depth).all()
-    assert np.isnan(some.depth[near]).all() and np.isfinite(some.depth[far]).all()
+    beside = all_have.xy[:, 0] - image.shape[1] // 2  # the nearer half is on the left
+    behind, others = (beside >= 0) & (beside < 2), (beside < -1) | (beside > 5)
+    assert behind.any() and (others & (beside < 0) & (beside > -4)).any() and np.isfinite(all_have.depth).all()
+    assert np.isnan(some.depth[behind]).all() and np.isfinite(some.depth[others]).all()
 
 
 def texture_recording(folder: Path, frames: int = 6) -> Path:

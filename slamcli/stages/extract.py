@@ -80,7 +80,7 @@ def _extract(dataset: Dataset, settings: ExtractConfig, i: int) -> _Frame:
         return _Frame(points, np.full(len(points), np.nan, np.float32), coarse=None, faults=faults)
     read = depth_at(depth, points.xy, window=settings.depth_window)
     if settings.depth_jump:
-        read = np.where(is_at_jump(depth, points.xy, jump=settings.depth_jump), np.float32(np.nan), read)
+        read = np.where(is_behind_outline(depth, points.xy, jump=settings.depth_jump), np.float32(np.nan), read)
     return _Frame(points, read, surface.coarse(depth), faults)
 
 
@@ -117,11 +117,12 @@ def depth_at(depth: np.ndarray, xy: np.ndarray, *, window: int = 1) -> np.ndarra
     return readings[np.arange(len(xy)), np.maximum(n - 1, 0) // 2]
 
 
-def is_at_jump(depth: np.ndarray, xy: np.ndarray, *, jump: float) -> np.ndarray:
-    """Say which raw points xy (N, 2) stand where depth (H, W) [m] jumps by more than the share `jump`, (N,) bool.
+def is_behind_outline(depth: np.ndarray, xy: np.ndarray, *, jump: float) -> np.ndarray:
+    """Say beside which raw points xy (N, 2) something else is nearer by more than the share `jump` of depth (H, W) [m], (N,) bool.
 
-    The outline of a thing before another is no fixed point in space, and a pixel more to the side its depth is that of the other.
-    Along a line over a plane, however slanted, the inverse of depth is linear in pixels: where it bends, the surface ends. In an image
+    Where a surface goes behind the outline of another is no fixed point in space, and a pixel more to that side the depth is the other's.
+    On the nearer side the corner of a thing mostly is one, so it keeps its depth.
+    Along a line over a plane, however slanted, the inverse of depth is linear in pixels: beside something nearer it bends up. In an image
     less than 640 pixels wide as many pixels span a wider angle, and each fold of a surface bends more: `jump` grows in proportion.
     """
     column, row = np.rint(xy).astype(np.int64).T
@@ -133,7 +134,7 @@ def is_at_jump(depth: np.ndarray, xy: np.ndarray, *, jump: float) -> np.ndarray:
     least = jump * max(1.0, USUAL_WIDTH / depth.shape[1])
     here, found = inverse(0, 0), np.zeros(len(xy), dtype=bool)
     for down, right in ((0, 1), (1, 0), (1, 1), (1, -1)):
-        found |= np.abs(inverse(down, right) + inverse(-down, -right) - 2.0 * here) > least * here
+        found |= inverse(down, right) + inverse(-down, -right) - 2.0 * here > least * here
     return found
 
 
