@@ -93,7 +93,7 @@ class ExtractConfig:
     )
     depth_jump: float = option(
         0.03,
-        "a key point has no depth where something beside it is nearer by more than this share, in an image 640 px wide: an outline hides its surface; 0 = all have: 40 % more APE in simulated rooms, as much on real recordings",
+        "a key point has no depth where something beside it is nearer by more than this share, in an image 640 px wide: that outline hides its surface; 0 = all have: up to 50 % more APE in simulated rooms, the same on real recordings within their spread",
         ge=0,
         le=1,
     )
