@@ -178,7 +178,8 @@ class OptimizeConfig:
     )
     move_depth: bool = option(True, "move depth readings to the colour image's time with the camera's own motion, by what the stamps say")
     readout: bool = option(
-        True, "find how long the camera takes to read a colour image, and take the rolling shutter out of the measurements"
+        True,
+        "find how long the camera takes to read a colour image and a depth image, and take the rolling shutters out of the measurements",
     )
     depth_delay: bool = option(True, "find by how much depth images are older than their stamps say, and take that out too")
     intrinsics: bool = option(
@@ -190,7 +191,7 @@ class OptimizeConfig:
         "find how depth readings are off: an offset of inverse depth, as of a constant error of disparity, and a factor, of which a recording says nothing; 2 % more APE on fr1_xyz, 15 % on fr3_teddy, the same in simulated rooms",
     )
     rounds: int = option(2, "turns of adjusting the map and finding those numbers", ge=1, le=10)
-    timing_prior: float = option(0.02, "how far from 0 readout time and delay are believed to be before looking [s]", gt=0, le=1)
+    timing_prior: float = option(0.02, "how far from 0 readout times and delay are believed to be before looking [s]", gt=0, le=1)
     focal_prior: float = option(
         0.02, "how far focal lengths are believed to be from the recording's calibration, as a share of them", gt=0, le=1
     )

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-FORMAT = 3  # of everything a run directory holds; raised whenever an array changes its meaning
+FORMAT = 4  # of everything a run directory holds; raised whenever an array changes its meaning
 
 
 def array(dtype: str, shape: str, meaning: str, *, may_lack: bool = False) -> Any:
@@ -33,6 +33,7 @@ class Features:
     offset: np.ndarray = array("i8", "F+1", "feature rows of a frame")
     xy: np.ndarray = array("f4", "M 2", "px, undistorted, column then row")
     depth: np.ndarray = array("f4", "M", "m along the optical axis, NaN where there is none; read at the raw pixel")
+    slope: np.ndarray = array("f4", "M 2", "1/m/px, growth of inverse depth to the right and downwards, 0 = unknown")
     octave: np.ndarray = array("u1", "M", "pyramid level")
     angle: np.ndarray = array("f4", "M", "rad, of the intensity centroid")
     desc: np.ndarray = array("u1", "M 32", "ORB descriptor, 256 bits")
@@ -119,6 +120,7 @@ class Timing:
     readout: np.ndarray = array(
         "f8", "", "s, between the first and the last row of a colour image; 0 = global shutter; the stamp is the middle row's"
     )
+    depth_readout: np.ndarray = array("f8", "", "s, the same of a depth image")
     depth_delay: np.ndarray = array(
         "f8", "", "s, by which depth images were taken later than their stamps say; NaN = depth is not moved to the colour stamp"
     )

@@ -95,7 +95,7 @@ def _results(rng: np.random.Generator, truth: Trajectory, lost: np.ndarray) -> d
     frames = len(truth.stamp)
     no_rows = np.zeros(frames + 1, np.int64)
     features = Features(
-        stamp=truth.stamp, depth_stamp=truth.stamp, offset=no_rows, xy=np.empty((0, 2), np.float32), depth=np.empty(0, np.float32),
+        stamp=truth.stamp, depth_stamp=truth.stamp, offset=no_rows, xy=np.empty((0, 2), np.float32), depth=np.empty(0, np.float32), slope=np.empty((0, 2), np.float32),
         octave=np.empty(0, np.uint8), angle=np.empty(0, np.float32), desc=np.empty((0, 32), np.uint8), octave_scale=np.array(1.2),
     )  # fmt: skip
     kf_frame = np.flatnonzero(~lost)[::KEY_FRAMES_EVERY].astype(np.int32)
@@ -110,7 +110,7 @@ def _results(rng: np.random.Generator, truth: Trajectory, lost: np.ndarray) -> d
     )  # fmt: skip
     track, loop = (_tracks(found[name].T_wc, kf_frame, lost) for name in ("track", "loop"))
     maps = {name: _map(T_wc[kf_frame], kf_frame) for name, T_wc in (("track", found["track"].T_wc), ("loop", found["loop"].T_wc))}
-    when = Timing(readout=np.array(0.0), depth_delay=np.array(0.0), twist=np.zeros((frames, 6)))
+    when = Timing(readout=np.array(0.0), depth_readout=np.array(0.0), depth_delay=np.array(0.0), twist=np.zeros((frames, 6)))
     return {
         "extract": (features,),
         "track": (track, maps["track"]),

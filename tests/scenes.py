@@ -98,6 +98,7 @@ def observe(
         offset=np.array(offset, dtype=np.int64),
         xy=joined["xy"].astype(np.float32),
         depth=joined["depth"].astype(np.float32),
+        slope=np.zeros((len(joined["depth"]), 2), dtype=np.float32),
         octave=joined["octave"].astype(np.uint8),
         angle=joined["angle"].astype(np.float32),
         desc=joined["desc"],

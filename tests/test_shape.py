@@ -37,7 +37,7 @@ def blind(n: int) -> tuple[Features, Words, Matches]:
     none, stamp = np.zeros(0), 10.0 + np.arange(n) / RATE
     features = Features(
         stamp=stamp, depth_stamp=stamp.copy(), offset=np.zeros(n + 1, np.int64), xy=np.zeros((0, 2), np.float32),
-        depth=none.astype("f4"), octave=none.astype("u1"), angle=none.astype("f4"), desc=np.zeros((0, 32), np.uint8), octave_scale=np.array(1.2),
+        depth=none.astype("f4"), slope=np.zeros((0, 2), "f4"), octave=none.astype("u1"), angle=none.astype("f4"), desc=np.zeros((0, 32), np.uint8), octave_scale=np.array(1.2),
     )  # fmt: skip
     words = Words(
         np.ones(5, "f4"), none.astype("i4"), np.zeros((0, 2), "i4"), np.zeros(n + 1, np.int64), none.astype("i4"), none.astype("f4")
@@ -169,7 +169,7 @@ def revisit(frames: list[int], *, n: int = 60, pixel_noise: float = 2.0) -> MapB
     stamp, rows = 10.0 + np.arange(len(frames)) / RATE, n * len(frames)
     features = Features(
         stamp=stamp, depth_stamp=stamp.copy(), offset=n * np.arange(len(frames) + 1), xy=(xy + rng.normal(0, pixel_noise, xy.shape)).astype("f4"),
-        depth=np.full(rows, np.nan, "f4"), octave=np.zeros(rows, "u1"), angle=np.zeros(rows, "f4"),
+        depth=np.full(rows, np.nan, "f4"), slope=np.zeros((rows, 2), "f4"), octave=np.zeros(rows, "u1"), angle=np.zeros(rows, "f4"),
         desc=np.tile(rng.integers(0, 256, (n, 32), dtype=np.uint8), (len(frames), 1)), octave_scale=np.array(1.2),
     )  # fmt: skip
     builder = MapBuilder(features)
@@ -193,7 +193,7 @@ def test_a_second_look_joins_key_frames_that_see_the_same_and_moves_them_to_wher
         n_inliers=np.full(n, 60, np.int32),
     )
     reliefs = Reliefs(CoarseDepth(corner().coarse_depth[frames]), KINECT, SENSOR)
-    sensing = Sensing(KINECT, Timing(np.array(0.0), np.array(0.0), np.zeros((n, 6))), {})
+    sensing = Sensing(KINECT, Timing(np.array(0.0), np.array(0.0), np.array(0.0), np.zeros((n, 6))), {})
     look = {"reliefs": reliefs, "iterations": 20, "progress": lambda items, label: items}
     after, result = hindsight.look_again(builder, tracks, sensing, SENSOR, TrackConfig(), shape_edges=most, **look)
     assert len(builder.edge) == {0: 0, 1: 3, 6: 6}[most]

@@ -16,7 +16,7 @@ from slamcli.errors import SlamError
 from slamcli.geometry.camera import Camera
 from slamcli.schema import Features, Flow, Matches, Words
 from slamcli.stages import extract, match
-from slamcli.vision import hamming, orb
+from slamcli.vision import depth_reading, hamming, orb
 
 
 class Tools:
@@ -63,18 +63,9 @@ def test_features_are_those_of_each_frame(room: Path, features: Features) -> Non
         column, row = np.rint(points.xy).astype(int).T
         depth, found = dataset.depth(i), np.isfinite(features.depth[span])
         np.testing.assert_array_equal(features.depth[span][found], depth[row, column][found])
-        is_without = np.isnan(depth[row, column]) | extract.is_behind_outline(depth, points.xy, jump=Config().extract.depth_jump)
+        is_without = np.isnan(depth[row, column]) | depth_reading.is_behind_outline(depth, points.xy, jump=Config().extract.depth_jump)
         np.testing.assert_array_equal(~found, is_without)
     assert 0.3 < np.isfinite(features.depth).mean() <= 1.0
-
-
-def test_depth_is_the_nearest_pixels_or_the_median_of_a_square() -> None:
-    depth = np.full((7, 8), np.nan, dtype=np.float32)
-    depth[2:5, 2:5] = [[1, 2, 3], [4, np.nan, 5], [6, 7, 8]]
-    depth[6, 7] = 9
-    xy = np.array([[3.3, 2.8], [1.6, 2.2], [6.9, 6.2], [0.0, 6.0]], dtype=np.float32)
-    np.testing.assert_array_equal(extract.depth_at(depth, xy), [np.nan, 1, 9, np.nan])
-    np.testing.assert_array_equal(extract.depth_at(depth, xy, window=3), [4, 2, 9, np.nan])
 
 
 def test_one_worker_or_three_give_the_same_files(room: Path, tmp_path: Path) -> None:
@@ -95,25 +86,6 @@ def test_camera_and_association_are_written_for_other_programs(room: Path, tmp_p
         i = dataset.colour_path.index(colour)
         assert depth == dataset.depth_path[i]
         assert [float(stamp), float(depth_stamp)] == pytest.approx([dataset.stamp[i], dataset.depth_stamp[i]], abs=1e-6)
-
-
-def test_what_is_behind_an_outline_is_told_from_the_outline_a_slope_a_fold_and_a_hole() -> None:
-    v, u = np.mgrid[:60, :640].astype(float)
-    slope = 1.0 / (0.2 + 0.004 * u + 0.001 * v)  # a plane: 5 m on the left, 1.9 m on the right
-    fold = 1.0 / (0.4 + 0.002 * np.abs(u - 40))
-    step = np.where(u < 40, 2.0, 2.3)
-    at = np.array([[x, 30.0] for x in (20.0, 36.0, 37.4, 40.0, 42.0, 43.0, 60.0)])
-    assert not extract.is_behind_outline(slope, at, jump=0.05).any() and not extract.is_behind_outline(fold, at, jump=0.05).any()
-    np.testing.assert_array_equal(extract.is_behind_outline(step, at, jump=0.05), [False, False, False, True, True, False, False])
-    assert not extract.is_behind_outline(step, at, jump=0.2).any()
-    corner = np.where((u < 40) & (v < 30), 2.0, 3.0)
-    assert extract.is_behind_outline(corner, np.array([[38.0, 28.0], [41.0, 31.0], [41.0, 20.0]]), jump=0.05).tolist() == [
-        False,
-        True,
-        True,
-    ]
-    step[28:33, 30:34] = np.nan
-    assert not extract.is_behind_outline(step, np.array([[28.0, 30.0], [32.0, 30.0]]), jump=0.05).any()
 
 
 def test_key_points_behind_an_outline_have_no_depth(tmp_path: Path) -> None:

@@ -46,7 +46,7 @@ class Inputs:
         T_kc = se3.inverse(T_wc[kf])[ref_kf] @ T_wc
         T_kc[frames.stop if frames.stop else n :] = np.nan  # not tracked
         self._records[Tracks] = Tracks(ref_kf, T_kc, none, none)
-        self._records[Timing] = Timing(np.array(0.0), np.array(0.0), np.zeros((n, 6)))
+        self._records[Timing] = Timing(np.array(0.0), np.array(0.0), np.array(0.0), np.zeros((n, 6)))
         self.runs = runs
 
     def delay_depth(self, seconds: float) -> None:

@@ -21,6 +21,7 @@ from slamcli.mapping import adjustment, bundle, bundle_kernels, timing
 from slamcli.mapping.mapbuilder import MapBuilder
 from slamcli.schema import Features, Timing
 
+TIMES = "readout", "depth_readout", "depth_delay"  # fields of Timing that are looked for
 SIGNIFICANT = 3.0  # standard deviations
 STEP = 1e-3  # of its prior sigma, by which an unknown of the calibration is moved to see what that does
 
@@ -47,6 +48,8 @@ def unknowns(camera: Camera, option: OptimizeConfig) -> dict[str, float]:
     prior = {}
     if option.readout:
         prior["readout"] = option.timing_prior
+    if option.readout and option.move_depth:
+        prior["depth_readout"] = option.timing_prior
     if option.move_depth and option.depth_delay:
         prior["depth_delay"] = option.timing_prior
     if option.intrinsics:
@@ -70,7 +73,8 @@ def recalibrate(features: Features, given: Camera, camera: Camera) -> Features:
     for start in range(0, len(xy), timing.ROWS_AT_ONCE):
         part = slice(start, start + timing.ROWS_AT_ONCE)
         xy[part] = camera.undistort(given.distort(features.xy[part]))
-    return replace(features, xy=xy, depth=camera.reread(features.depth, given))
+    slope = features.slope * np.float32(camera.depth_scale / given.depth_scale)
+    return replace(features, xy=xy, depth=camera.reread(features.depth, given), slope=slope)
 
 
 def estimate_sensing(builder: MapBuilder, given: Camera, now: Sensing, sensor: SensorConfig, *, prior: dict[str, float]) -> Sensing | None:
@@ -101,7 +105,7 @@ def estimate_sensing(builder: MapBuilder, given: Camera, now: Sensing, sensor: S
     better = dict(zip(names, value.tolist(), strict=True))
     if "depth_scale" in better:
         better["depth_scale"] *= 1.0 - better["inverse_depth_offset"] * pivot
-    when = {name: np.array(better.pop(name)) for name in ("readout", "depth_delay") if name in better}
+    when = {name: np.array(better.pop(name)) for name in TIMES if name in better}
     return Sensing(replace(now.camera, **better), replace(now.timing, **when), dict(zip(names, found.sigma.tolist(), strict=True)))
 
 
@@ -122,12 +126,13 @@ def _column(name: str, features: Features, rows: np.ndarray, predicted: np.ndarr
     pivot : [m] depth of readings that the offset of inverse depth leaves as they are
     """
     column = np.zeros((len(rows), 3))
-    if name in ("readout", "depth_delay"):
-        px_per_s, depth_per_s, share = timing.flow(features, now.timing.twist, now.camera, rows)
+    if name in TIMES:
+        moving = timing.flow(features, now.timing.twist, now.camera, rows)
         if name == "readout":
-            column[:, :2] = -px_per_s * share[:, None]
+            column[:, :2] = -moving.px_per_s * moving.share[:, None]
+            column[:, 2] = -moving.slant_per_s * moving.share
         else:
-            column[:, 2] = -depth_per_s
+            column[:, 2] = -moving.reading_per_s * (moving.share if name == "depth_readout" else 1.0)
         return column
     if name in ("depth_scale", "inverse_depth_offset"):
         z, offset = predicted[:, 2], now.camera.inverse_depth_offset

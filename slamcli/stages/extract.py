@@ -15,10 +15,7 @@ from slamcli.geometry.camera import Camera
 from slamcli.mapping import surface
 from slamcli.parallel import ordered_map
 from slamcli.schema import CoarseDepth, Features, Flow
-from slamcli.vision import flow, orb
-
-USUAL_WIDTH = 640  # px
-JUMP_REACH = 3  # px to either side of a key point where a jump of depth is looked for: as far as FAST looks
+from slamcli.vision import depth_reading, flow, orb
 
 
 @dataclass(frozen=True)
@@ -27,6 +24,7 @@ class _Frame:
 
     points: orb.KeyPoints
     depth: np.ndarray  # (N,) float32 [m]
+    slope: np.ndarray  # (N, 2) float32 [1/m/px] of the inverse of depth
     coarse: np.ndarray | None  # (V, U) uint16, None where there is no depth
     faults: list[str]  # why an image could not be used
 
@@ -69,7 +67,7 @@ def _extract(dataset: Dataset, settings: ExtractConfig, i: int) -> _Frame:
     try:
         grey = dataset.grey(i)
     except BadFrame as error:
-        return _Frame(orb.no_key_points(), np.zeros(0, np.float32), coarse=None, faults=[str(error)])
+        return _Frame(orb.no_key_points(), np.zeros(0, np.float32), np.zeros((0, 2), np.float32), None, [str(error)])
     points = detect(grey, settings)
     try:
         depth = dataset.depth(i)
@@ -77,11 +75,12 @@ def _extract(dataset: Dataset, settings: ExtractConfig, i: int) -> _Frame:
         depth = None
         faults.append(str(error))
     if depth is None:
-        return _Frame(points, np.full(len(points), np.nan, np.float32), coarse=None, faults=faults)
-    read = depth_at(depth, points.xy, window=settings.depth_window)
+        nowhere = np.full(len(points), np.nan, np.float32)
+        return _Frame(points, nowhere, slope=np.zeros((len(points), 2), np.float32), coarse=None, faults=faults)
+    read = depth_reading.depth_at(depth, points.xy, window=settings.depth_window)
     if settings.depth_jump:
-        read = np.where(is_behind_outline(depth, points.xy, jump=settings.depth_jump), np.float32(np.nan), read)
-    return _Frame(points, read, surface.coarse(depth), faults)
+        read = np.where(depth_reading.is_behind_outline(depth, points.xy, jump=settings.depth_jump), np.float32(np.nan), read)
+    return _Frame(points, read, depth_reading.inverse_depth_slope(depth, points.xy), surface.coarse(depth), faults)
 
 
 def detect(grey: np.ndarray, settings: ExtractConfig) -> orb.KeyPoints:
@@ -101,43 +100,6 @@ def detect(grey: np.ndarray, settings: ExtractConfig) -> orb.KeyPoints:
     )
 
 
-def depth_at(depth: np.ndarray, xy: np.ndarray, *, window: int = 1) -> np.ndarray:
-    """Read depth (H, W) [m] around raw points xy (N, 2) inside the image, (N,) float32.
-
-    window [px], odd : 1 reads the nearest pixel; more gives the median of the readings in a square, the nearer of two, NaN where there is none
-    """
-    column, row = np.rint(xy).astype(np.int64).T
-    if window == 1:
-        return depth[row, column]
-    reach = np.arange(window) - window // 2
-    rows = np.clip(row[:, None] + reach, 0, depth.shape[0] - 1)
-    columns = np.clip(column[:, None] + reach, 0, depth.shape[1] - 1)
-    readings = np.sort(depth[rows[:, :, None], columns[:, None, :]].reshape(len(xy), window * window), axis=1)  # NaN last
-    n = np.isfinite(readings).sum(axis=1)
-    return readings[np.arange(len(xy)), np.maximum(n - 1, 0) // 2]
-
-
-def is_behind_outline(depth: np.ndarray, xy: np.ndarray, *, jump: float) -> np.ndarray:
-    """Say beside which raw points xy (N, 2) something else is nearer by more than the share `jump` of depth (H, W) [m], (N,) bool.
-
-    Where a surface goes behind the outline of another is no fixed point in space, and a pixel more to that side the depth is the other's.
-    On the nearer side the corner of a thing mostly is one, so it keeps its depth.
-    Along a line over a plane, however slanted, the inverse of depth is linear in pixels: beside something nearer it bends up. In an image
-    less than 640 pixels wide as many pixels span a wider angle, and each fold of a surface bends more: `jump` grows in proportion.
-    """
-    column, row = np.rint(xy).astype(np.int64).T
-
-    def inverse(down: int, right: int) -> np.ndarray:
-        rows = np.clip(row + JUMP_REACH * down, 0, depth.shape[0] - 1)
-        return 1.0 / depth[rows, np.clip(column + JUMP_REACH * right, 0, depth.shape[1] - 1)]
-
-    least = jump * max(1.0, USUAL_WIDTH / depth.shape[1])
-    here, found = inverse(0, 0), np.zeros(len(xy), dtype=bool)
-    for down, right in ((0, 1), (1, 0), (1, 1), (1, -1)):
-        found |= inverse(down, right) + inverse(-down, -right) - 2.0 * here > least * here
-    return found
-
-
 def write_camera(out: Path, camera: Camera) -> None:
     """Write `camera.json`: the recording's calibration, and in later stages what is known of the camera by then."""
     (out / "camera.json").write_text(json.dumps(camera.to_dict(), indent=2) + "\n")
@@ -152,6 +114,7 @@ def _table(dataset: Dataset, camera: Camera, found: list[_Frame], scale: float) 
         offset=np.cumsum([0] + [len(p) for p in points], dtype=np.int64),
         xy=camera.undistort(raw).astype(np.float32),
         depth=np.concatenate([frame.depth for frame in found]),
+        slope=np.concatenate([frame.slope for frame in found]),
         octave=np.concatenate([p.octave for p in points]),
         angle=np.concatenate([p.angle for p in points]),
         desc=np.concatenate([p.desc for p in points]),

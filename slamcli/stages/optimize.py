@@ -21,7 +21,7 @@ def run(inputs, out: Path, cfg, tools) -> dict:
     features, tracks, map_ = inputs.load(Features, "extract"), inputs.load(Tracks, "track"), inputs.load(Map, "track")
     given = inputs.camera()
     delay = np.array(0.0 if cfg.optimize.move_depth else np.nan)
-    still = Timing(readout=np.array(0.0), depth_delay=delay, twist=timing.frame_twists(features.stamp, tracks, map_))
+    still = Timing(np.array(0.0), np.array(0.0), depth_delay=delay, twist=timing.frame_twists(features.stamp, tracks, map_))
     sensing, summary = Sensing(given, still, {}), {}
     if cfg.optimize.enabled and len(map_.kf_frame) > 1:
         builder = MapBuilder.from_map(features, map_)
@@ -74,7 +74,7 @@ def told(sensing: Sensing) -> dict:
     """Tell the numbers found with their standard deviations."""
     figures = {}
     for name, sigma in sensing.sigma.items():
-        is_time = name in ("readout", "depth_delay")
+        is_time = name in selfcalibration.TIMES
         unit = 1e3 if is_time else 1.0
         value = getattr(sensing.timing if is_time else sensing.camera, name)
         figures[f"{name}_ms" if is_time else name] = [float(f"{unit * one:.6g}") for one in (float(value), sigma)]
