@@ -1,5 +1,7 @@
 """The detector as a whole: what it promises on pictures and on what is no picture."""
 
+from functools import partial
+
 import cv2
 import numpy as np
 import pytest
@@ -130,14 +132,19 @@ def test_points_come_back_where_a_warp_takes_them() -> None:
     assert error["ours"] < 0.6 * error["plain"]
 
 
-def test_points_are_spread_more_evenly_as_plain_orb() -> None:
+def test_points_are_spread_more_evenly_than_plain_orbs_and_the_fewer_weak_ones_are_allowed_the_less() -> None:
     grey = np.full((480, 640), 120, np.uint8)
     rng = np.random.default_rng(5)
     rough, faint = (cv2.GaussianBlur(rng.normal(0, 1, shape), (0, 0), 2) * 7 for shape in ((160, 200), (240, 640)))
     grey[40:200, 60:260] = np.clip(128 + 60 * rough, 0, 255)  # a bunch of strong texture above faint texture
     grey[240:, :] = 110 + 8 * faint
-    ours, plain = (evenness(detect(grey).xy, 640, 480) for detect in (orb.detect, plain_orb))
-    assert ours.share >= 1.5 * plain.share and ours.ratio <= 0.5 * plain.ratio
+    none, ours, every, plain = (
+        evenness(detect(grey).xy, 640, 480)
+        for detect in (partial(orb.detect, weak=0.0), orb.detect, partial(orb.detect, weak=1.0), plain_orb)
+    )
+    assert ours.share >= 1.5 * plain.share and ours.ratio <= 0.75 * plain.ratio
+    assert every.share >= 1.5 * ours.share and every.ratio <= 0.5 * plain.ratio
+    assert none.share < 0.5 * ours.share
 
 
 def test_evenness_of_known_spreads() -> None:

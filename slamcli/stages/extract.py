@@ -95,6 +95,7 @@ def detect(grey: np.ndarray, settings: ExtractConfig) -> orb.KeyPoints:
         threshold_low=settings.fast_threshold_low,
         smooth=settings.smooth,
         pool=settings.pool,
+        weak=settings.weak,
         rank_by=settings.rank_by,
         subpixel=settings.subpixel,
     )

@@ -156,7 +156,9 @@ def _peaks(
 @kernel
 def _keep(
     threshold: i8,
+    weak: f8,
     at_most: i8[::1],
+    first_cell: i8[::1],
     histogram: i4[:, ::1],
     xy: i4[:, ::1],
     strength: u1[::1],
@@ -168,22 +170,31 @@ def _keep(
     """Choose peaks cell by cell: those above the threshold; where a cell has none, all of it, or only the best (of equals the first).
 
     at_most : (levels,) int64; where more than so many of a level pass, its threshold is the highest that as many exceed, and such a
-    cell gives only its best; 0 : no bound
+    cell gives only its best; of these the strongest count, as many as are the share `weak` of `at_most`; 0 : no bound
+    first_cell : (levels + 1,) int64, of each level
     The chosen are moved to the front of xy, strength, response (N,) float32; `first` is made to fit. `best` is used up.
     """
-    n = 0
+    n, weaker = 0, np.zeros(256, dtype=np.int64)
     for level in range(len(at_most)):
-        least, is_bounded = threshold, at_most[level] > 0
+        least, floor, is_bounded = threshold, 0, at_most[level] > 0
         if is_bounded:
             score, n_above = 255, 0
             while score > threshold and n_above + histogram[level, score] < at_most[level]:
                 n_above += histogram[level, score]
                 score -= 1
             least = score - 1 if score > threshold else threshold
+            weaker[:] = 0
+            for c in range(first_cell[level], first_cell[level + 1]):
+                if best[c] <= least:
+                    weaker[best[c]] += 1
+            floor, n_weak = least, 0
+            while floor > 0 and n_weak + weaker[floor] <= weak * at_most[level]:
+                n_weak += weaker[floor]
+                floor -= 1
         start, first[level] = first[level], n
         for k in range(start, first[level + 1]):
             s, c = strength[k], cell_of[k]
-            if s > least or (best[c] <= least and (s == best[c] or not is_bounded)):
+            if s > least or (best[c] <= least and (not is_bounded or (s == best[c] and s > floor))):
                 if s <= least and is_bounded:
                     best[c] = 0  # satisfied: no peak has this score
                 xy[n, 0], xy[n, 1], strength[n], response[n] = xy[k, 0], xy[k, 1], s, s
@@ -270,7 +281,15 @@ class Finder:
         self._response = np.empty(room, np.float32)
 
     def corners(
-        self, image: np.ndarray, *, cell: int, threshold: int, threshold_low: int, at_most: np.ndarray, rank_by: str = "sum"
+        self,
+        image: np.ndarray,
+        *,
+        cell: int,
+        threshold: int,
+        threshold_low: int,
+        at_most: np.ndarray,
+        weak: float = 1.0,
+        rank_by: str = "sum",
     ) -> Corners:
         """Find the FAST corners of all levels.
 
@@ -278,15 +297,17 @@ class Finder:
         cell [px] : a cell without a corner at `threshold` gives those at `threshold_low` [grey levels]
         at_most : (levels,) int64; where more corners of a level pass than this, its threshold is raised until about as many are left,
         and a cell without any gives only its best one; 0 : the threshold stays, and such a cell gives all it has
+        weak : such best ones, the strongest first, are at most this share of `at_most`
         rank_by : "sum" for the response of [Z] (1), "fast" for the FAST score
         """
         corner_score(image, self.box, self.border - FIT_RADIUS, self._score)
-        best = np.zeros(sum(-(-height // cell) * -(-width // cell) for height, width in self._inside), dtype=np.uint8)
+        first_cell = np.cumsum([0] + [-(-height // cell) * -(-width // cell) for height, width in self._inside], dtype=np.int64)
+        best = np.zeros(first_cell[-1], dtype=np.uint8)
         histogram, first = np.zeros((len(self.box), 256), dtype=np.int32), np.empty(len(self.box) + 1, dtype=np.int64)
         found = self._xy, self._strength, self._cell_of, best
         low = np.uint8(min(threshold, threshold_low))
         _peaks(self._score, self.box, self.border, cell, low, self._row, self._row.view(np.uint64), *found, histogram, first)
-        _keep(threshold, at_most, histogram, *found, first, self._response)
+        _keep(threshold, weak, at_most, first_cell, histogram, *found, first, self._response)
         xy, response = self._xy[: first[-1]], self._response[: first[-1]]
         if rank_by == "sum":
             _response(image, xy, response)

@@ -42,13 +42,15 @@ def detect(
     threshold_low: int = 5,
     smooth: bool = True,
     pool: float = 1.3,
+    weak: float = 0.13,
     rank_by: str = "fast",
     subpixel: bool = True,
 ) -> KeyPoints:
     """Find at most `features` key points of a grey image (H, W) uint8, spread over image and levels.
 
     levels, scale : of the pyramid; cell [px] : side of the cells in which FAST falls back from `threshold` to `threshold_low` [grey levels]
-    smooth : seek corners in a slightly blurred copy; pool : corners kept for each key point wanted, 0 : all; rank_by : see `fast.corners`
+    smooth : seek corners in a slightly blurred copy; pool : corners kept for each key point wanted, 0 : all
+    weak, rank_by : see `fast.Finder.corners`
     subpixel : move each point to the summit of the FAST score around it
     An image too small for one key point gives none. Raises SlamError where the array is no 8-bit grey image.
     """
@@ -66,6 +68,7 @@ def detect(
         threshold=threshold,
         threshold_low=threshold_low,
         at_most=np.array([max(round(pool * features * area / space.area), 1) if pool else 0 for area in space.areas]),
+        weak=weak,
         rank_by=rank_by,
     )
     wanted = shares(features, space.areas, np.diff(corners.first).tolist())
