@@ -81,7 +81,7 @@ class ExtractConfig:
     )
     weak: float = option(
         0.13,
-        "corners of cells without a strong one, the strongest first, are at most this share of those kept; 1: 3 % less APE on the real recordings, the same in simulated rooms, but fewer points are found again ten frames on than of OpenCV's ORB",
+        "corners of cells without a strong one, the strongest first, are at most this share of those kept; 1: 3 % less APE on the real recordings, the same in simulated rooms, and in one of two corridors a third of it, but fewer points are found again ten frames on than of OpenCV's ORB",
         ge=0,
         le=1,
     )
@@ -99,7 +99,7 @@ class ExtractConfig:
     )
     depth_jump: float = option(
         0.03,
-        "a key point has no depth where something beside it is nearer by more than this share, in an image 640 px wide: that outline hides its surface; 0 = all have: up to 50 % more APE in simulated rooms, the same on real recordings within their spread",
+        "a key point has no depth where something beside it is nearer by more than this share, in an image 640 px wide: that outline hides its surface; 0 = all have: up to 75 % more APE in simulated rooms, the same on real recordings within their spread",
         ge=0,
         le=1,
     )
