@@ -81,7 +81,7 @@ class ExtractConfig:
     )
     weak: float = option(
         0.13,
-        "corners of cells without a strong one, the strongest first, are at most this share of those kept; 1: 3 % less APE on the real recordings, the same in simulated rooms, and in one of two corridors a third of it, but fewer points are found again ten frames on than of OpenCV's ORB",
+        "corners of cells without a strong one, the strongest first, are at most this share of those kept where there are enough others; 1: 3 % less APE on the real recordings, the same in simulated rooms, and in one of two corridors a third of it, but fewer points are found again ten frames on than of OpenCV's ORB",
         ge=0,
         le=1,
     )

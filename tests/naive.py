@@ -321,13 +321,8 @@ def local_maxima(score: np.ndarray, threshold: int) -> np.ndarray:
     return peak
 
 
-def cell_corners(
-    peak: np.ndarray, border: int, cell: int, threshold: int, only_best: bool, most_weak: int = 10**9
-) -> list[tuple[int, int]]:
-    """Corners (x, y) in reading order: per cell those above the threshold, else all, or the first of the best.
-
-    most_weak : of these best ones the strongest count, all of one strength or none of it, so many at most
-    """
+def cell_corners(peak: np.ndarray, border: int, cell: int, threshold: int, only_best: bool) -> list[tuple[int, int]]:
+    """Corners (x, y) in reading order: per cell those above the threshold, else all, or the first of the best."""
     height, width = peak.shape
     chosen = []
     for top in range(border, height - border, cell):
@@ -337,10 +332,6 @@ def cell_corners(
             strong = [(x, y) for x, y in inside if peak[y, x] > threshold]
             weak = [max(inside, key=lambda at: peak[at[1], at[0]])] if inside and only_best else inside
             chosen += strong or weak
-    if only_best:
-        strength = sorted((int(peak[y, x]) for x, y in chosen if peak[y, x] <= threshold), reverse=True)
-        floor = strength[most_weak] if len(strength) > most_weak else 0
-        chosen = [(x, y) for x, y in chosen if peak[y, x] > min(floor, threshold)]
     return sorted(chosen, key=lambda at: (at[1], at[0]))
 
 

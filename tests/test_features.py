@@ -103,6 +103,35 @@ def test_memory_used_again_changes_nothing() -> None:
     np.testing.assert_array_equal(again.summits(np.arange(len(again.xy))), fresh.summits(np.arange(len(fresh.xy))))
 
 
+@settings(max_examples=25, deadline=None)
+@given(seeds, st.sampled_from([0.0, 0.1, 0.3, 1.0]), st.sampled_from([10, 60, 5000]))
+def test_of_the_corners_that_empty_cells_give_the_strongest_stay_as_many_as_are_allowed_or_left_open(
+    seed: int, weak: float, at_most: int
+) -> None:
+    image = texture(seed, 120, 160)
+    image[:, 80:] = image[:, 80:] // 4 + 90
+    options = {"cell": 6, "threshold": 30, "threshold_low": 3, "at_most": at_most, "rank_by": "fast"}
+    every, found, none = (
+        {(x, y): s for (x, y), s in zip(of.xy.tolist(), of.response.tolist(), strict=True)}
+        for of in (corners_of(image, weak=share, **options) for share in (5000.0, weak, 0.0))
+    )
+    is_raised = len({at for at, s in every.items() if s > 30}) > at_most
+    strong = set(none) if is_raised else {at for at, s in every.items() if s > 30}
+    left_out = {s for at, s in every.items() if at not in found}
+    n_weak, allowed = len(found.keys() - strong), max(weak * at_most, 0 if is_raised else at_most - len(strong))
+    assert strong <= found.keys() <= every.keys() and n_weak <= allowed
+    # All of the next strength together would be too many.
+    if left_out:
+        assert all(found[at] > max(left_out) for at in found.keys() - strong)
+        assert n_weak + sum(s == max(left_out) for at, s in every.items() if at not in strong) > allowed
+
+
+def test_a_faint_picture_gives_all_it_has() -> None:
+    faint = texture(3, 240, 320) // 8 + 100
+    every, few = (corners_of(faint, cell=12, threshold=30, threshold_low=2, at_most=1000, weak=weak) for weak in (1.0, 0.0))
+    assert 100 < len(every.xy) == len(few.xy) < 1000
+
+
 def hostile() -> dict[str, np.ndarray]:
     """Pictures at the ends of what 8 bits can hold, and such with very many equal scores."""
     v, u = np.mgrid[0:52, 0:58]
@@ -126,10 +155,9 @@ def test_on_hostile_pictures_each_kernel_is_its_twin(name: str) -> None:
     score = score_of(image)
     np.testing.assert_array_equal(score, naive.fast_score(image))
     peak = naive.local_maxima(score, 5)
-    for only_best, most_weak in ((False, 3), (True, image.size), (True, 3), (True, 0)):
-        at_most, weak = (image.size, most_weak / image.size) if only_best else (0, 0.0)
-        found = corners_of(image, cell=7, threshold=40, threshold_low=5, at_most=at_most, weak=weak)
-        assert [tuple(at) for at in found.xy.tolist()] == naive.cell_corners(peak, 19, 7, 40, only_best, most_weak)
+    for only_best in (False, True):
+        found = corners_of(image, cell=7, threshold=40, threshold_low=5, at_most=image.size if only_best else 0)
+        assert [tuple(at) for at in found.xy.tolist()] == naive.cell_corners(peak, 19, 7, 40, only_best)
     places = found.summits(np.arange(len(found.xy)))
     assert np.isfinite(places).all() and (np.abs(places - found.xy) <= 1).all()
     smooth = apply(filters.blur_2px, image)

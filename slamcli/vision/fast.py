@@ -170,7 +170,7 @@ def _keep(
     """Choose peaks cell by cell: those above the threshold; where a cell has none, all of it, or only the best (of equals the first).
 
     at_most : (levels,) int64; where more than so many of a level pass, its threshold is the highest that as many exceed, and such a
-    cell gives only its best; of these the strongest count, as many as are the share `weak` of `at_most`; 0 : no bound
+    cell gives only its best; of these the strongest count, as many as are the share `weak` of `at_most`, or as the others leave open; 0 : no bound
     first_cell : (levels + 1,) int64, of each level
     The chosen are moved to the front of xy, strength, response (N,) float32; `first` is made to fit. `best` is used up.
     """
@@ -182,13 +182,14 @@ def _keep(
             while score > threshold and n_above + histogram[level, score] < at_most[level]:
                 n_above += histogram[level, score]
                 score -= 1
-            least = score - 1 if score > threshold else threshold
+            least, n_open = (score - 1, 0.0) if score > threshold else (threshold, float(at_most[level] - n_above))
+            n_weak_most = max(weak * at_most[level], n_open)
             weaker[:] = 0
             for c in range(first_cell[level], first_cell[level + 1]):
                 if best[c] <= least:
                     weaker[best[c]] += 1
             floor, n_weak = least, 0
-            while floor > 0 and n_weak + weaker[floor] <= weak * at_most[level]:
+            while floor > 0 and n_weak + weaker[floor] <= n_weak_most:
                 n_weak += weaker[floor]
                 floor -= 1
         start, first[level] = first[level], n
@@ -297,7 +298,7 @@ class Finder:
         cell [px] : a cell without a corner at `threshold` gives those at `threshold_low` [grey levels]
         at_most : (levels,) int64; where more corners of a level pass than this, its threshold is raised until about as many are left,
         and a cell without any gives only its best one; 0 : the threshold stays, and such a cell gives all it has
-        weak : such best ones, the strongest first, are at most this share of `at_most`
+        weak : such best ones, the strongest first, are at most this share of `at_most`, or what the others leave of it
         rank_by : "sum" for the response of [Z] (1), "fast" for the FAST score
         """
         corner_score(image, self.box, self.border - FIT_RADIUS, self._score)
