@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-FORMAT = 4  # of everything a run directory holds; raised whenever an array changes its meaning
+FORMAT = 5  # of everything a run directory holds; raised whenever an array changes its meaning
 
 
 def array(dtype: str, shape: str, meaning: str, *, may_lack: bool = False) -> Any:
@@ -103,7 +103,7 @@ class Map:
 
     kf_frame: np.ndarray = array("i4", "K", "frame index, increasing")
     kf_segment: np.ndarray = array("i4", "K", "segment a key frame belongs to")
-    T_wk: np.ndarray = array("f8", "K 4 4", "key frame's camera to its segment's world")
+    T_wk: np.ndarray = array("f8", "K 4 4", "key frame's camera to its segment's world, the camera of its first frame with a pose")
     lm_xyz: np.ndarray = array("f8", "L 3", "m, world")
     obs_lm: np.ndarray = array("i4", "O", "sorted by (landmark, key frame), pairs unique")
     obs_kf: np.ndarray = array("i4", "O", "row in kf_frame")
@@ -141,7 +141,9 @@ class Closures:
 class Ground:
     """The floor and the level frame `l` (z up, floor at z = 0), by densify."""
 
-    T_lw: np.ndarray = array("f8", "4 4", "world to level; identity up to a turn to z up where no floor was found")
+    T_lw: np.ndarray = array(
+        "f8", "4 4", "world to level: origin below the first camera, x its heading; without a floor the first camera is at z = 0"
+    )
     plane: np.ndarray = array("f8", "4", "a b c d of a x + b y + c z + d = 0 in the world frame, unit normal pointing up; [L] (17)")
     inlier_rms: np.ndarray = array("f8", "", "m, distance of the inliers to the plane")
     inlier_share: np.ndarray = array("f8", "", "inliers among the candidate ground points")

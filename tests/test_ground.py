@@ -21,8 +21,10 @@ def seen(T_lc, *, seed=0, clean=False):
     return [(z, T_wl @ T) for z, T in zip(depth, T_lc, strict=True)], T_wl
 
 
-def find(frames, settings=SETTINGS, camera=KINECT):
-    return find_ground(frames, camera, settings=settings, rng=np.random.default_rng(0))
+def find(frames, settings=SETTINGS, camera=KINECT, T_wc=None):
+    if T_wc is None:
+        T_wc = frames[0][1] if isinstance(frames, list) and frames and np.isfinite(frames[0][1]).all() else np.eye(4)
+    return find_ground(frames, camera, T_wc=T_wc, settings=settings, rng=np.random.default_rng(0))
 
 
 def error_of(found, T_wl):
@@ -102,6 +104,17 @@ def test_the_level_frame_follows_the_first_camera():
     assert T_lk[2, 3] == pytest.approx(0.6, abs=0.01)
     assert T_lk[1, 2] == pytest.approx(0.0, abs=1e-9)  # the view has no part along y
     assert T_lk[0, 2] > 0.9
+
+
+@pytest.mark.parametrize("searched", [slice(0, None), slice(7, None, 3), slice(5, 6)])
+def test_the_origin_is_below_the_camera_named_whichever_frames_the_floor_is_found_in(searched):
+    frames, _ = seen(ATTITUDES["a drive around"])
+    T_wc = frames[2][1]
+    found = find(frames[searched], T_wc=T_wc)
+    T_lc = found.T_lw @ T_wc
+    assert found.is_found
+    np.testing.assert_allclose(T_lc[[0, 1, 1], [3, 3, 2]], 0.0, atol=1e-9)  # x, y, and the view's part along y
+    assert T_lc[0, 2] > 0.9
 
 
 def test_the_world_frame_does_not_matter():

@@ -73,6 +73,42 @@ def test_what_a_run_shows_is_the_main_segment(apart):
     assert read_tum(apart.folder / "loop/keyframes.txt").stamp.max() < stamp[60]
 
 
+def assert_begins_at_identity(path):
+    np.testing.assert_allclose(read_tum(path).T_wc[0], np.eye(4), atol=2e-9)  # the file holds nine decimals
+
+
+@pytest.mark.parametrize("stage", ["track", "optimize", "loop"])
+def test_the_world_of_each_segment_is_its_first_frames_camera(apart, stage):
+    tracks, map_ = apart.result(stage)
+    for segment, name in enumerate(("trajectory.txt", "trajectory_segment1.txt")):
+        assert_begins_at_identity(apart.folder / stage / name)
+        first = np.flatnonzero(frame_segments(tracks, map_) == segment)[0]
+        np.testing.assert_allclose(frame_poses(tracks, map_, segment)[first], np.eye(4), atol=1e-9)
+
+
+def test_anchoring_moves_key_frames_landmarks_and_frames_of_a_segment_together(apart):
+    tracks, map_ = apart.result("loop")
+    moved = replace(map_, T_wk=map_.T_wk.copy(), lm_xyz=map_.lm_xyz.copy())
+    lm_segment = map_.kf_segment[map_.obs_kf[np.searchsorted(map_.obs_lm, np.arange(len(map_.lm_xyz)))]]
+    for segment in (0, 1):
+        T = se3.exp(np.random.default_rng(segment).normal(size=6))
+        moved.T_wk[map_.kf_segment == segment] = T @ map_.T_wk[map_.kf_segment == segment]
+        moved.lm_xyz[lm_segment == segment] = se3.transform(T, map_.lm_xyz[lm_segment == segment])
+    anchored = segments.anchored(moved, tracks)
+    np.testing.assert_allclose(anchored.T_wk, map_.T_wk, atol=1e-9)
+    np.testing.assert_allclose(anchored.lm_xyz, map_.lm_xyz, atol=1e-9)
+
+
+def test_a_frame_found_before_the_first_key_frame_is_the_origin(apart):
+    tracks, map_ = apart.result("loop")
+    T_kc = tracks.T_kc.copy()
+    T_kc[0] = se3.exp(np.array([0.1, -0.2, 0.05, 0.03, 0.1, 0.0]))  # as if hindsight had found it from the key frame that follows
+    ref_kf = tracks.ref_kf.copy()
+    ref_kf[0] = 1
+    early = replace(tracks, T_kc=T_kc, ref_kf=ref_kf)
+    np.testing.assert_allclose(frame_poses(early, segments.anchored(map_, early))[0], np.eye(4), atol=1e-12)
+
+
 def test_another_segment_can_be_asked_for(apart):
     _, map_ = apart.result("optimize")
     tracks = apart.load(Tracks, "optimize")
@@ -92,6 +128,9 @@ def test_segments_that_saw_one_place_are_joined(tmp_path):
     tracks, map_ = run.result("loop")
     assert (tracks.state != LOST).all() and not run.warnings[1:]
     assert 1e-5 < ape(frame_poses(tracks, map_), run.scene.T_gc) < 0.015
+    assert_begins_at_identity(tmp_path / "loop/trajectory.txt")
+    vertices = [line.split() for line in (tmp_path / "loop/posegraph.g2o").read_text().splitlines() if line.startswith("VERTEX")]
+    np.testing.assert_allclose(np.array([v[2:5] for v in vertices], dtype=float), map_.T_wk[:, :3, 3], atol=1e-8)
 
 
 def test_a_place_known_from_an_earlier_segment_is_recognised(tmp_path):

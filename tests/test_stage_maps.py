@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
 
+import boxroom
 import numpy as np
 import pytest
 
@@ -265,3 +266,43 @@ def test_frames_without_depth_are_passed_over_and_bad_ones_told_of(recording: Pa
         assert len(cloud.read(tmp_path / "densify" / "cloud.ply")[0]) == len(octomap.read(tmp_path / "octree" / "map.bt")) == 0
         assert any("cloud is empty" in message for message in tools.warnings)
         assert any("octree is empty" in message for message in tools.warnings)
+
+
+class BoxRoom(SimpleNamespace):
+    """A recording of the analytic room."""
+
+    def __len__(self) -> int:
+        return self.n
+
+
+class Drive(Inputs):
+    """Key frames in any number along a drive through the analytic room, each with its depth image."""
+
+    def __init__(self, n: int) -> None:
+        steps = np.linspace(0.0, 1.0, n)
+        T_lc = [boxroom.look_along([1.0 + 3.0 * s, 1.0 + 2.0 * s, 0.6], 0.2 + 2.0 * s, 0.35) for s in steps]
+        self.T_wl = se3.inverse(T_lc[0])
+        T_wk, kf, none = self.T_wl @ np.array(T_lc), np.arange(n, dtype=np.int32), np.zeros(0)
+        stamp = kf / 30.0
+        self._records = {
+            Features: SimpleNamespace(stamp=stamp, depth_stamp=stamp),
+            Map: Map(kf, 0 * kf, T_wk, none.reshape(0, 3), none.astype("i4"), none.astype("i4"), none.astype("i8")),
+            Tracks: Tracks(kf, np.tile(np.eye(4), (n, 1, 1)), none, none),
+            Timing: Timing(np.array(0.0), np.array(0.0), np.array(0.0), np.zeros((n, 6))),
+        }
+        self.dataset = BoxRoom(
+            n=n,
+            camera=boxroom.KINECT,
+            depth=lambda i, camera: boxroom.render(T_lc[i]),
+            rgb=lambda i: np.zeros((120, 160, 3), np.uint8),
+        )
+
+
+@pytest.mark.parametrize("n", [1, 2, 41, 400])
+def test_the_level_frame_begins_below_the_first_camera_for_any_number_of_key_frames(n: int, tmp_path: Path) -> None:
+    summary = densify.run(Drive(n), tmp_path, CFG, Tools())
+    assert summary["is_floor_found"] and summary["key_frames"] == n
+    T_lc = artifacts.load(Ground, tmp_path).T_lw  # the world is the first camera's frame
+    np.testing.assert_allclose(T_lc[[0, 1, 1], [3, 3, 2]], 0.0, atol=1e-9)  # x, y, and the view's part along y
+    assert T_lc[0, 2] > 0.9
+    assert T_lc[2, 3] == pytest.approx(0.6, abs=0.01)

@@ -26,32 +26,37 @@ PEAK_HALF_WIDTH = 0.12  # [m] first guess of a plane's inliers; takes up 2 degre
 
 
 def find_ground(
-    frames: Iterable[tuple[np.ndarray, np.ndarray]], camera: Camera, *, settings: GroundConfig, rng: np.random.Generator
+    frames: Iterable[tuple[np.ndarray, np.ndarray]],
+    camera: Camera,
+    *,
+    T_wc: np.ndarray,
+    settings: GroundConfig,
+    rng: np.random.Generator,
 ) -> Ground:
     """Find the floor and the frame in which it is level.
 
-    frames : per key frame, in order, (depth (H, W) float32 [m], NaN = none; T_wk (4, 4) camera to world)
+    frames : (depth (H, W) float32 [m], NaN = none; T_wk (4, 4) camera to world) per key frame, any choice of them
+    T_wc : (4, 4) camera to world, of the camera below which the level frame has its origin and whose heading is the x axis
     Returns Ground; `is_found` is False where no floor is in view, and `T_lw` then only turns the world so that z is up at best guess,
-    with the first camera at z = 0. The level frame's origin is the first key frame's position dropped to the floor, its x axis that
-    camera's heading.
+    with that camera at z = 0.
     """
     patches, T_wk = collect(frames, camera, side=settings.stride, max_range=settings.max_range)
     if len(T_wk) == 0:
-        return _not_found(np.eye(4), up=np.array([0.0, -1.0, 0.0]))
+        return _not_found(T_wc, up=-T_wc[:3, 1])
     up = vertical(patches, T_wk)
     if settings.method == "paper":
         support = paper_plane(patches, up, settings=settings, rng=rng)
     else:
         support = lowest_plane(patches, up, settings=settings)
     if support is None:
-        return _not_found(T_wk[0], up)
+        return _not_found(T_wc, up)
     above = float(np.median(T_wk[:, :3, 3] @ support.plane[:3] + support.plane[3]))
     plane = support.plane if above >= 0.0 else -support.plane  # the camera is above the floor
     if abs(above) < settings.min_height or plane[:3] @ up < settings.min_cosine:  # a table at eye level, a wall
-        return _not_found(T_wk[0], up)
+        return _not_found(T_wc, up)
     distance = patches.xyz[support.inliers] @ plane[:3] + plane[3]
     return Ground(
-        T_lw=level_frame(plane, T_wk[0]),
+        T_lw=level_frame(plane, T_wc),
         plane=plane,
         inlier_rms=np.array(np.sqrt(np.mean(distance**2))),
         inlier_share=np.array(len(support.inliers) / support.n_candidates),
@@ -168,24 +173,24 @@ def _nothing_below(patches: Patches, support: Support, settings: GroundConfig) -
     return bool(below <= settings.max_below * len(support.inliers))
 
 
-def level_frame(plane: np.ndarray, T_wk: np.ndarray) -> np.ndarray:
-    """Give T_lw (4, 4): z along the plane's normal, z = 0 on it, origin below the camera T_wk, x along that camera's heading."""
+def level_frame(plane: np.ndarray, T_wc: np.ndarray) -> np.ndarray:
+    """Give T_lw (4, 4): z along the plane's normal, z = 0 on it, origin below the camera T_wc, x along that camera's heading."""
     up = plane[:3]
-    heading = T_wk[:3, 2] - (T_wk[:3, 2] @ up) * up
+    heading = T_wc[:3, 2] - (T_wc[:3, 2] @ up) * up
     if np.linalg.norm(heading) < 0.2:  # looking straight down: the image's up is ahead
-        heading = -T_wk[:3, 1] + (T_wk[:3, 1] @ up) * up
+        heading = -T_wc[:3, 1] + (T_wc[:3, 1] @ up) * up
     x = heading / np.linalg.norm(heading)
     T_lw = np.eye(4)
     T_lw[:3, :3] = np.stack([x, np.cross(up, x), up])
-    foot = T_wk[:3, 3] - (T_wk[:3, 3] @ up + plane[3]) * up
+    foot = T_wc[:3, 3] - (T_wc[:3, 3] @ up + plane[3]) * up
     T_lw[:3, 3] = -T_lw[:3, :3] @ foot
     return T_lw
 
 
-def _not_found(T_wk: np.ndarray, up: np.ndarray) -> Ground:
-    plane = np.append(up, -up @ T_wk[:3, 3])
+def _not_found(T_wc: np.ndarray, up: np.ndarray) -> Ground:
+    plane = np.append(up, -up @ T_wc[:3, 3])
     return Ground(
-        T_lw=level_frame(plane, T_wk),
+        T_lw=level_frame(plane, T_wc),
         plane=plane,
         inlier_rms=np.array(np.nan),
         inlier_share=np.array(0.0),

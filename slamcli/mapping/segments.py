@@ -8,7 +8,7 @@ from slamcli.geometry import se3
 from slamcli.mapping import closure
 from slamcli.mapping.closure import Candidate
 from slamcli.mapping.mapbuilder import MapBuilder
-from slamcli.schema import Map, Tracks, frame_segments
+from slamcli.schema import Map, Tracks, frame_poses, frame_segments
 
 AGREE_M, AGREE_RAD = 0.1, 0.05  # closures that differ by less agree on how two segments lie
 OUTWEIGH = 2.0  # times the landmarks of any others that agree on something else
@@ -22,6 +22,26 @@ def ranked(map_: Map, tracks: Tracks, main: int = 0) -> Map:
     order = np.argsort(-size, kind="stable")
     order = np.concatenate([order[main : main + 1], np.delete(order, main)]) if main < n else order
     return replace(map_, kf_segment=np.argsort(order)[map_.kf_segment].astype(np.int32))
+
+
+def anchored(map_: Map, tracks: Tracks) -> Map:
+    """Express each segment in the camera frame of its first frame with a pose, so that every trajectory begins at the identity.
+
+    Joining two segments, or finding a frame before the first key frame, leaves another camera than the first at the world's origin.
+    """
+    T_wk, lm_xyz = map_.T_wk.copy(), map_.lm_xyz.copy()
+    first_obs = np.searchsorted(map_.obs_lm, np.arange(len(lm_xyz)))
+    lm_segment = map_.kf_segment[map_.obs_kf[first_obs]]
+    for segment in range(n_segments(map_)):
+        T_wc = frame_poses(tracks, map_, segment)
+        frames = np.flatnonzero(np.isfinite(T_wc[:, 0, 0]))
+        if len(frames) == 0:
+            continue
+        T_cw = se3.inverse(T_wc[frames[0]])
+        kfs, lms = map_.kf_segment == segment, lm_segment == segment
+        T_wk[kfs] = T_cw @ T_wk[kfs]
+        lm_xyz[lms] = se3.transform(T_cw, lm_xyz[lms])
+    return replace(map_, T_wk=T_wk, lm_xyz=lm_xyz)
 
 
 def n_segments(map_: Map) -> int:

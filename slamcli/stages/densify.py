@@ -17,6 +17,7 @@ from slamcli.parallel import ordered_map
 from slamcli.schema import Features, Map, Timing, Tracks, frame_poses
 
 SAMPLES_APART = 0.75  # voxels from sample to sample of a near surface: denser ones gain nothing
+FIRST_CAMERA = np.eye(4)  # the world is its frame; the level frame's origin is below it
 GROUND_FRAMES = 40  # key frames, evenly spread, that are searched for the floor; more do not move it
 
 
@@ -38,7 +39,7 @@ def run(inputs: Any, out: Path, cfg: Any, tools: Any) -> dict:
             if n_used % every == 0:
                 yield view.depth, view.T_wk
 
-    floor = ground.find_ground(frames(), camera, settings=cfg.ground, rng=tools.rng())
+    floor = ground.find_ground(frames(), camera, T_wc=FIRST_CAMERA, settings=cfg.ground, rng=tools.rng())
     if not floor.is_found:
         tools.warn("no floor was found: the level frame is the first camera's, turned to z up")
     if option.method == "tsdf":

@@ -42,9 +42,9 @@ def run(inputs, out: Path, cfg, tools) -> dict:
             iterations=cfg.loop.iterations,
             progress=tools.progress,
         )
-    write_pose_graph(out / "posegraph.g2o", builder, accepted, cfg.loop)
+    map_ = segments.anchored(main_first(builder.snapshot(), tracks, cfg.loop.main_segment), tracks)
+    write_pose_graph(out / "posegraph.g2o", map_.T_wk, closure.pose_graph(builder, accepted, cfg.loop))
     write_candidates(out / "candidates.csv", tried)
-    map_ = main_first(builder.snapshot(), tracks, cfg.loop.main_segment)
     for segment, told in enumerate(segments_apart(tracks, map_), start=1):
         tools.warn(f"{told}, could not be joined: their poses, in a frame of their own, are in {segment_file(segment)}; no map shows them")
     save_map_stage(out, features.stamp, tracks, map_)
@@ -155,7 +155,6 @@ def write_candidates(path: Path, candidates: list[Candidate]) -> None:
             writer.writerow([c.kf_i, c.kf_j, f"{c.score:.4f}", c.n_matches, c.n_inliers, int(c.is_accepted), c.reason])
 
 
-def write_pose_graph(path: Path, builder: MapBuilder, accepted: list[Candidate], settings) -> None:
+def write_pose_graph(path: Path, T_wk: np.ndarray, graph: closure.PoseGraph) -> None:
     """Write the key frames, the edges between them as the final map has them, and the closures as they were measured."""
-    graph = closure.pose_graph(builder, accepted, settings)
-    posegraph.write_g2o(path, builder.kf.T_wk, graph.edge_kf, graph.edge_T_ij, graph.information)
+    posegraph.write_g2o(path, T_wk, graph.edge_kf, graph.edge_T_ij, graph.information)

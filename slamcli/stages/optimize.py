@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from slamcli import artifacts
-from slamcli.mapping import adjustment, hindsight, selfcalibration, timing
+from slamcli.mapping import adjustment, hindsight, segments, selfcalibration, timing
 from slamcli.mapping.localiser import NO_RELIEFS
 from slamcli.mapping.mapbuilder import MapBuilder
 from slamcli.mapping.selfcalibration import Sensing
@@ -27,7 +27,7 @@ def run(inputs, out: Path, cfg, tools) -> dict:
         builder = MapBuilder.from_map(features, map_)
         reliefs = Reliefs(inputs.load(CoarseDepth, "extract"), given, cfg.sensor)
         tracks, sensing, summary = refine(builder, features, tracks, sensing, cfg, tools, reliefs=reliefs)
-        map_ = builder.snapshot()
+        map_ = segments.anchored(builder.snapshot(), tracks)
     save_map_stage(out, features.stamp, tracks, map_)
     artifacts.save(tracks, out)
     artifacts.save(sensing.timing, out)

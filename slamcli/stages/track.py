@@ -36,7 +36,7 @@ def run(inputs, out: Path, cfg, tools) -> dict:
     for i in tools.progress(range(len(features.stamp)), "track"):
         tracker.process(i)
     tracks = tracker.tracks()
-    map_ = segments.ranked(tracker.map(), tracks)
+    map_ = segments.anchored(segments.ranked(tracker.map(), tracks), tracks)
     lost = lost_spans(tracks.state, tracker.lost_reason)
     for first, last, reason in lost:
         tools.warn(f"frames {first} to {last} are lost: {reason}" if last > first else f"frame {first} is lost: {reason}")
