@@ -21,11 +21,11 @@ import accuracy
 import bench
 import numpy as np
 
-from slamcli import config_io
-from slamcli.config import Config
+from slamcli.config import toml
+from slamcli.config.options import Config
 from slamcli.datasets import open_dataset
 from slamcli.errors import SlamError
-from slamcli.rundir import RunDir
+from slamcli.runs.run_directory import RunDir
 
 LEVERS = {  # how each is turned, and what it is
     "extract.subpixel=false": "sub-pixel key points",
@@ -76,7 +76,7 @@ def measured(recording: str, offset: int, seed: int, levers: list[str], out: Pat
     of = {"recording": source.name, "is_simulated": (source.root / "scene.json").is_file(), "offset": offset, "seed": seed}
     pairs = []
     for lever in levers:
-        turned = accuracy.variant(default, folder / "turned", config_io.apply(default.config(), [lever]))
+        turned = accuracy.variant(default, folder / "turned", toml.apply(default.config(), [lever]))
         pairs.append({**of, "lever": lever, "default": figures(default), "turned": figures(turned)})
         print(json.dumps(pairs[-1]), file=sys.stderr, flush=True)
     return pairs

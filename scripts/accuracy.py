@@ -26,12 +26,13 @@ import numpy as np
 import rewritten
 import rivals
 
-from slamcli import config_io, evaluate
-from slamcli.config import Config
+from slamcli.config import toml
+from slamcli.config.options import Config
 from slamcli.console import table
 from slamcli.errors import SlamError
-from slamcli.pipeline import Pipeline
-from slamcli.rundir import RunDir
+from slamcli.evaluation import trajectory_error
+from slamcli.runs.pipeline import Pipeline
+from slamcli.runs.run_directory import RunDir
 from slamcli.stages import stage_named
 
 STAGES = ("track", "optimize", "loop")
@@ -83,7 +84,7 @@ def measured(recording: str, given: argparse.Namespace) -> list[Result]:
         for seed in given.seeds:
             run = features
             for who, changes in (("A", []), ("B", given.change))[: 2 if given.change else 1]:
-                config = replace(config_io.apply(Config(), [*given.both, *changes]), seed=seed)
+                config = replace(toml.apply(Config(), [*given.both, *changes]), seed=seed)
                 run = variant(run, features.path.parent / who, config)
                 found.append(replace(ours(run), recording=Path(recording).name, offset=offset, every=every, who=who))
                 print(line_of(found[-1]), flush=True)
@@ -127,7 +128,7 @@ def to_run(run: RunDir, before: Config, after: Config) -> tuple[str, ...]:
 
 def ours(run: RunDir) -> Result:
     """Give the error after each stage of a run."""
-    told = {stage: rivals.accuracy(run, evaluate.stage_trajectory(run, stage)) for stage in STAGES}
+    told = {stage: rivals.accuracy(run, trajectory_error.stage_trajectory(run, stage)) for stage in STAGES}
     errors = {stage: float("nan") if f["ape"] is None else f["ape"] for stage, f in told.items()}
     cpu = sum(run.record(stage)["cpu_seconds"] - run.record(stage)["compile_seconds"] for stage in STAGES)
     return Result("", 0, 1, run.config().seed, "", errors, told["loop"]["coverage"], 1e3 * cpu / rivals.n_frames(run))

@@ -28,10 +28,10 @@ import cv2
 import published
 import rivals
 
-from slamcli import evaluate
 from slamcli.console import table
 from slamcli.errors import SlamError
-from slamcli.rundir import RunDir
+from slamcli.evaluation import trajectory_error
+from slamcli.runs.run_directory import RunDir
 from slamcli.stages import NAMES
 
 HEADINGS = ["stage", "wall [s]", "CPU [s]", "compiling [s]", "CPU [ms/frame]", "frames/s", "peak [MiB]", "output [MB]"]
@@ -127,7 +127,7 @@ def ours(run: RunDir) -> dict[str, Any]:
         "wall_seconds": sum(record["seconds"] - record["compile_seconds"] for record in records),
         "peak_mib": max(record["peak_rss_mb"] for record in records),
     }
-    return {**figures, **rivals.accuracy(run, evaluate.stage_trajectory(run, "loop"))}
+    return {**figures, **rivals.accuracy(run, trajectory_error.stage_trajectory(run, "loop"))}
 
 
 def plain_orb_ms(run: RunDir) -> float:

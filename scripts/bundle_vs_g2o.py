@@ -15,13 +15,13 @@ from pathlib import Path
 
 import numpy as np
 
+from slamcli.estimation import bundle_adjustment
 from slamcli.geometry import se3
 from slamcli.geometry.camera import Camera
-from slamcli.mapping import bundle
 from slamcli.parallel import one_thread_in_blas
 
 CAMERA = Camera(width=640, height=480, fx=520.0, fy=520.0, cx=319.5, cy=239.5)
-LIMITS = np.array([bundle.CHI2_95_2DOF, bundle.CHI2_95_3DOF])
+LIMITS = np.array([bundle_adjustment.CHI2_95_2DOF, bundle_adjustment.CHI2_95_3DOF])
 SEEN_BY, AMONG = 6, 8  # key frames that observe a landmark, of so many that could
 
 
@@ -69,24 +69,24 @@ def compare(n_kf: int, n_lm: int, seed: int, *, repeats: int, iterations: int = 
             return G2oBundle(*problem, is_fixed=is_fixed, limits=LIMITS, folder=Path(folder))
 
         adjust = {"is_fixed": is_fixed, "tolerance": 0.0}
-        short = bundle.adjust(*problem, max_iterations=iterations, **adjust)  # compiles
-        prepared = bundle.Problem(*problem, is_fixed)
+        short = bundle_adjustment.adjust(*problem, max_iterations=iterations, **adjust)  # compiles
+        prepared = bundle_adjustment.Problem(*problem, is_fixed)
         g2o_ms = loop_ms = total_ms = built_ms = np.inf
         for _ in range(repeats):  # in turn, so that what else the machine does meets both
             peer = build()
             start = peer.cost()
             g2o_ms = min(g2o_ms, cpu_ms(lambda peer=peer: peer.optimize(iterations)) / iterations)
             after = peer.cost()
-            loop_ms = min(loop_ms, cpu_ms(lambda: bundle._minimise(prepared, prepared.T, prepared.x, LIMITS, iterations, 0.0)))
-            built_ms = min(built_ms, cpu_ms(lambda: bundle.Problem(*problem, is_fixed)))
-            total_ms = min(total_ms, cpu_ms(lambda: bundle.adjust(*problem, max_iterations=iterations, **adjust)))
+            loop_ms = min(loop_ms, cpu_ms(lambda: bundle_adjustment._minimise(prepared, prepared.T, prepared.x, LIMITS, iterations, 0.0)))
+            built_ms = min(built_ms, cpu_ms(lambda: bundle_adjustment.Problem(*problem, is_fixed)))
+            total_ms = min(total_ms, cpu_ms(lambda: bundle_adjustment.adjust(*problem, max_iterations=iterations, **adjust)))
         for _ in range(60):
             before = peer.cost()
             peer.optimize(10)
             if before - peer.cost() <= 1e-9 * before:
                 break
         g2o_cost = peer.cost()
-    final = bundle.adjust(*problem, max_iterations=100, is_fixed=is_fixed, tolerance=1e-12)
+    final = bundle_adjustment.adjust(*problem, max_iterations=100, is_fixed=is_fixed, tolerance=1e-12)
     print(f"  cost at the start         ours {short.cost[0]:.6f}  g2o {start:.6f}  difference {short.cost[0] / start - 1:+.1e}")
     print(f"  cost after {iterations} iterations  ours {short.cost[-1]:.6f}  g2o {after:.6f}")
     print(f"  cost at the end           ours {final.cost[-1]:.6f}  g2o {g2o_cost:.6f}  difference {final.cost[-1] / g2o_cost - 1:+.1e}")

@@ -16,11 +16,11 @@ from pathlib import Path
 import numpy as np
 import rewritten
 
-from slamcli import evaluate
 from slamcli.console import table
 from slamcli.errors import SlamError
+from slamcli.evaluation import trajectory_error
 from slamcli.formats.trajectory import read_tum
-from slamcli.rundir import RunDir
+from slamcli.runs.run_directory import RunDir
 from slamcli.schema import Trajectory
 
 HEADINGS = ["recording", "frames", "visible", "with a pose", "coverage", "segments", "APE [m]", "to undisturbed"]
@@ -36,7 +36,7 @@ def main() -> None:
     given = parser.parse_args()
     try:
         lists = rewritten.listed(given.recording)
-        reference = evaluate.stage_trajectory(run_of(rewritten.write(given.out / "undisturbed", lists), given.out), "loop")
+        reference = trajectory_error.stage_trajectory(run_of(rewritten.write(given.out / "undisturbed", lists), given.out), "loop")
         rows = [row("undisturbed", lists, 0, 1, reference, reference), *disturbed(lists, reference, given.out, given.frames, given.seconds)]
         print(table([HEADINGS, *rows, half_in_half(lists, reference, given.out)], right=range(1, len(HEADINGS))))
     except SlamError as error:
@@ -54,7 +54,7 @@ def disturbed(lists: rewritten.Listed, reference: Trajectory, out: Path, frames:
     for name, (changed, n_black) in variants.items():
         run = run_of(rewritten.write(out / name, changed), out)
         n_segments = int(run.record("loop")["summary"]["segments"])
-        rows.append(row(name, changed, n_black, n_segments, evaluate.stage_trajectory(run, "loop"), reference))
+        rows.append(row(name, changed, n_black, n_segments, trajectory_error.stage_trajectory(run, "loop"), reference))
     return rows
 
 
@@ -95,7 +95,7 @@ def error(found: Trajectory, truth: Trajectory | None, n_frames: int) -> float:
     """Give the RMSE of the absolute pose error [m]."""
     if truth is None:
         raise SlamError("the recording has no ground truth to compare with")
-    return evaluate.statistics(evaluate.ape(found, truth, n_frames=n_frames, name="trajectory").error)["rmse"]
+    return trajectory_error.statistics(trajectory_error.ape(found, truth, n_frames=n_frames, name="trajectory").error)["rmse"]
 
 
 if __name__ == "__main__":

@@ -24,8 +24,8 @@ import numpy as np
 from feature_truth import Recording, pairs_within
 from scipy.spatial import cKDTree
 
-from slamcli import config_io
-from slamcli.config import Config, MatchConfig
+from slamcli.config import toml
+from slamcli.config.options import Config, MatchConfig
 from slamcli.errors import SlamError
 from slamcli.parallel import ordered_map
 from slamcli.stages.extract import detect as detect_under
@@ -258,7 +258,7 @@ def main() -> None:
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
     try:
-        settings = config_io.apply(Config(), arguments.assignments)
+        settings = toml.apply(Config(), arguments.assignments)
         for target in arguments.recordings:
             for line in report(Recording(target), settings, arguments.pairs):
                 print(line, flush=True)

@@ -15,10 +15,10 @@ from pathlib import Path
 
 import rewritten
 
-from slamcli import evaluate
 from slamcli.console import table
 from slamcli.errors import SlamError
-from slamcli.rundir import RunDir
+from slamcli.evaluation import trajectory_error
+from slamcli.runs.run_directory import RunDir
 from slamcli.stages import NAMES
 
 HEADINGS = ["stage", "first part [ms/frame]", "rest [ms/frame]", "ratio", "share of the whole", "peak of first [MiB]", "of whole [MiB]"]
@@ -78,8 +78,10 @@ def seconds(run: RunDir, stage: str) -> float:
 def summary(run: RunDir) -> str:
     """Tell what became of a run."""
     loop, key_frames = run.record("loop")["summary"], run.record("track")["summary"]["key_frames"]
-    found = evaluate.ape(evaluate.stage_trajectory(run, "loop"), evaluate.ground_truth(run), n_frames=loop["frames"], name="loop")
-    ape = evaluate.statistics(found.error)["rmse"]
+    found = trajectory_error.ape(
+        trajectory_error.stage_trajectory(run, "loop"), trajectory_error.ground_truth(run), n_frames=loop["frames"], name="loop"
+    )
+    ape = trajectory_error.statistics(found.error)["rmse"]
     return f"{loop['frames']} frames: {key_frames} key frames, {loop['closures']} closures, {loop['lost']} lost, APE {ape:.4f} m"
 
 

@@ -6,8 +6,8 @@ as its data sheet says. It gets the poses of the camera's own map, so that only 
 
 import numpy as np
 
-from slamcli.grid_truth import Scene, cast
-from slamcli.mapping.grid import decide
+from slamcli.evaluation.grid_truth import Scene, cast
+from slamcli.navigation.grid import decide
 from slamcli.schema import Grid
 
 NEAR, FAR = 0.02, 5.6  # [m]

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from slamcli.evaluation.grid_truth import Scene
 from slamcli.geometry import se3
-from slamcli.grid_truth import Scene
-from slamcli.mapping.grid import FREE, OCCUPIED
+from slamcli.navigation.grid import FREE, OCCUPIED
 from slamcli.schema import Grid
 
 SEARCH = 0.12  # [m] to either side

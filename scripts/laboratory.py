@@ -22,16 +22,16 @@ import numpy as np
 from lab_laser import laser_grid
 from lab_measure import Reading, measure, outlines, table_2
 
-from slamcli import grid_truth
 from slamcli.cli.grid import camera_path
 from slamcli.errors import SlamError
+from slamcli.evaluation import grid_truth
+from slamcli.evaluation.grid_truth import Scene
 from slamcli.geometry import se3
-from slamcli.grid_picture import draw
-from slamcli.grid_truth import Scene
-from slamcli.mapping import grid as grid_module
-from slamcli.mapping import planner
-from slamcli.rundir import RunDir
+from slamcli.navigation import grid as grid_module
+from slamcli.navigation import planner
+from slamcli.runs.run_directory import RunDir
 from slamcli.schema import Features, Grid, Ground, Map, Tracks, frame_poses
+from slamcli.visualization.grid_picture import draw
 
 PAPER = {"--speed": 0.15, "--turn-rate": 0.15, "--rate": 15, "--laps": 1.03, "--field-of-view": 57, "--depth-min": 1.2, "--depth-max": 3.5}
 SENSOR = ("sensor.depth_min=1.2", "sensor.depth_max=3.5", "grid2d.min_range=1.2", "grid2d.max_range=3.5")

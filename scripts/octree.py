@@ -19,16 +19,16 @@ from pathlib import Path
 
 import numpy as np
 
-from slamcli import evaluate, grid_truth
 from slamcli.console import table
+from slamcli.dense import occupancy
+from slamcli.dense.occupancy import OccupancyMap
 from slamcli.errors import SlamError
+from slamcli.evaluation import grid_truth, trajectory_error
 from slamcli.formats import cloud, octomap
 from slamcli.geometry import se3
 from slamcli.geometry.octree import Octree, expand, prune
-from slamcli.mapping import occupancy
-from slamcli.mapping.occupancy import OccupancyMap
 from slamcli.parallel import one_thread_in_blas
-from slamcli.rundir import RunDir
+from slamcli.runs.run_directory import RunDir
 from slamcli.schema import Features, Ground, Map
 from slamcli.stages.densify import depth_poses
 from slamcli.stages.octree import scans
@@ -69,7 +69,9 @@ def truth(run: RunDir) -> list[str]:
     """Distances of the cloud to the scene it was rendered from, the trajectory aligned to the true one."""
     scene = grid_truth.read_scene(run.dataset().root / "scene.json")
     n_frames = len(run.load(Features, "extract").stamp)
-    aligned = evaluate.ape(evaluate.stage_trajectory(run, "loop"), evaluate.ground_truth(run), n_frames=n_frames, name="")
+    aligned = trajectory_error.ape(
+        trajectory_error.stage_trajectory(run, "loop"), trajectory_error.ground_truth(run), n_frames=n_frames, name=""
+    )
     xyz = cloud.read_ply(run.stage_path("densify", "cloud.ply"))[0].astype(np.float64)
     error = 1e3 * surface_distance(scene, se3.transform(aligned.T_gw @ se3.inverse(run.load(Ground, "densify").T_lw), xyz))
     quantiles = np.quantile(error, [0.5, 0.95, 0.99, 1.0])

@@ -17,11 +17,11 @@ from pathlib import Path
 import numpy as np
 import rivals
 
-from slamcli import evaluate
 from slamcli.console import table
 from slamcli.datasets.tum import associate
+from slamcli.evaluation import trajectory_error
 from slamcli.geometry import se3
-from slamcli.rundir import RunDir
+from slamcli.runs.run_directory import RunDir
 from slamcli.schema import Closures, Features, Map
 from slamcli.stages import NAMES
 
@@ -62,7 +62,7 @@ class Figures:
     def row(self) -> list[str]:
         """Make a line of the table."""
         counts = (self.n_frames, self.lost, self.segments, self.closures, self.revisits, self.false)
-        errors = (f"{self.ape[stage]:.4f}" for stage in evaluate.STAGES)
+        errors = (f"{self.ape[stage]:.4f}" for stage in trajectory_error.STAGES)
         rival = "" if self.rival is None else f"{self.rival:.4f}"
         return [self.name, *map(str, counts), *errors, f"{100 * self.loop_share:.1f} %", rival]
 
@@ -97,11 +97,11 @@ def one(folder: Path, name: str, options: list[str], laps: float, rival: list[st
         slamcli("simulate", str(recording), *options)
     slamcli("run", str(recording), "-r", str(path), "--until", "grid2d")
     run = RunDir.find(str(path))
-    truth, n_frames = evaluate.ground_truth(run), len(run.load(Features, "extract").stamp)
+    truth, n_frames = trajectory_error.ground_truth(run), len(run.load(Features, "extract").stamp)
     ape = {}
-    for stage in evaluate.STAGES:
-        error = evaluate.ape(evaluate.stage_trajectory(run, stage), truth, n_frames=n_frames, name=stage).error
-        ape[stage] = evaluate.statistics(error)["rmse"]
+    for stage in trajectory_error.STAGES:
+        error = trajectory_error.ape(trajectory_error.stage_trajectory(run, stage), truth, n_frames=n_frames, name=stage).error
+        ape[stage] = trajectory_error.statistics(error)["rmse"]
     frames, is_true = closures(run)
     summary_ = run.record("loop")["summary"]
     cpu = {stage: record["cpu_seconds"] - record["compile_seconds"] for stage in NAMES if (record := run.record(stage)) is not None}
@@ -122,7 +122,7 @@ def one(folder: Path, name: str, options: list[str], laps: float, rival: list[st
 
 def closures(run: RunDir) -> tuple[np.ndarray, np.ndarray]:
     """Give the frames (C, 2) of each accepted closure and whether it is true (C,)."""
-    found, stamp, truth = run.load(Closures, "loop"), run.load(Features, "extract").stamp, evaluate.ground_truth(run)
+    found, stamp, truth = run.load(Closures, "loop"), run.load(Features, "extract").stamp, trajectory_error.ground_truth(run)
     T_gc = np.full((len(stamp), 4, 4), np.nan)
     rows = associate(stamp, truth.stamp)
     T_gc[rows[:, 0]] = truth.T_wc[rows[:, 1]]

@@ -7,10 +7,10 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from slamcli import evaluate
 from slamcli.errors import SlamError
+from slamcli.evaluation import trajectory_error
 from slamcli.formats.trajectory import read_tum
-from slamcli.rundir import RunDir
+from slamcli.runs.run_directory import RunDir
 
 HERE = Path(__file__).parent
 
@@ -43,10 +43,10 @@ def accuracy(run: RunDir, found: Any) -> dict[str, Any]:
     """Give APE [m], None where no pose can be compared, and the share of colour frames with a pose."""
     coverage = len(found.stamp) / n_frames(run)
     try:
-        error = evaluate.ape(found, evaluate.ground_truth(run), n_frames=n_frames(run), name=str(run.path)).error
+        error = trajectory_error.ape(found, trajectory_error.ground_truth(run), n_frames=n_frames(run), name=str(run.path)).error
     except SlamError:
         return {"ape": None, "coverage": coverage}
-    return {"ape": evaluate.statistics(error)["rmse"], "coverage": coverage}
+    return {"ape": trajectory_error.statistics(error)["rmse"], "coverage": coverage}
 
 
 def n_frames(run: RunDir) -> int:

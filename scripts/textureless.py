@@ -14,9 +14,9 @@ from pathlib import Path
 
 import rivals
 
-from slamcli import evaluate
 from slamcli.console import table
-from slamcli.rundir import RunDir
+from slamcli.evaluation import trajectory_error
+from slamcli.runs.run_directory import RunDir
 from slamcli.schema import Features
 
 ROOMS = {"dark": ["--dark"], "plain": ["--textured", "0"], "mixed": ["--textured", "0.3"]}
@@ -49,8 +49,11 @@ def one(folder: Path, options: list[str], rival: list[str] | None) -> list[str]:
         slamcli("simulate", str(recording), *options)
     slamcli("run", str(recording), "-r", str(path), "--until", "loop")
     run = RunDir.find(str(path))
-    truth, n_frames = evaluate.ground_truth(run), len(run.load(Features, "extract").stamp)
-    errors = [evaluate.ape(evaluate.stage_trajectory(run, s), truth, n_frames=n_frames, name=s).error for s in evaluate.STAGES]
+    truth, n_frames = trajectory_error.ground_truth(run), len(run.load(Features, "extract").stamp)
+    errors = [
+        trajectory_error.ape(trajectory_error.stage_trajectory(run, s), truth, n_frames=n_frames, name=s).error
+        for s in trajectory_error.STAGES
+    ]
     track = run.record("track")
     cpu = 1e3 * (track["cpu_seconds"] - track["compile_seconds"]) / n_frames
     return [
@@ -58,7 +61,7 @@ def one(folder: Path, options: list[str], rival: list[str] | None) -> list[str]:
         str(n_frames),
         f"{100 * len(errors[-1]) / n_frames:.1f} %",
         str(track["summary"]["on_shape"]),
-        *(f"{evaluate.statistics(error)['rmse']:.4f}" for error in errors),
+        *(f"{trajectory_error.statistics(error)['rmse']:.4f}" for error in errors),
         f"{cpu:.1f}",
         of_rival(run, *rival) if rival else "",
     ]

@@ -16,11 +16,11 @@ def _kernel_cache() -> str:
     """Choose where numba keeps compiled kernels.
 
     numba recompiles a kernel when its own file changes but does not notice a change in a helper of another file. Kernels share
-    helpers only through `geometry/`, and numba's settings through `kernels.py`, so a folder per state of these makes stale machine
+    helpers only through `geometry/`, and numba's settings through `jit/kernel.py`, so a folder per state of these makes stale machine
     code impossible.
     """
     digest, package = hashlib.sha256(), Path(__file__).parent
-    for source in (package / "kernels.py", *sorted((package / "geometry").glob("*.py"))):
+    for source in (package / "jit" / "kernel.py", *sorted((package / "geometry").glob("*.py"))):
         digest.update(source.read_bytes())
     folder = user_cache() / f"kernels-{digest.hexdigest()[:12]}"
     try:

@@ -4,12 +4,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from slamcli.estimation import bundle_adjustment
 from slamcli.geometry import se3
 from slamcli.geometry.camera import Camera
-from slamcli.mapping import bundle
 
 CAMERA = Camera(width=640, height=480, fx=520.0, fy=515.0, cx=319.5, cy=240.5)
-LIMITS = (bundle.CHI2_95_2DOF, bundle.CHI2_95_3DOF)
+LIMITS = (bundle_adjustment.CHI2_95_2DOF, bundle_adjustment.CHI2_95_3DOF)
 
 
 @dataclass(frozen=True)

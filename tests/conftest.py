@@ -8,7 +8,7 @@ import pytest
 from click.testing import CliRunner, Result
 from hypothesis import settings
 
-from slamcli import compilation
+from slamcli.jit import compilation
 
 ROOM_FRAMES = 40
 

@@ -8,9 +8,9 @@ import sys
 from pathlib import Path
 from types import ModuleType
 
-from slamcli.config import Config
-from slamcli.pipeline import Pipeline
-from slamcli.rundir import RunDir
+from slamcli.config.options import Config
+from slamcli.runs.pipeline import Pipeline
+from slamcli.runs.run_directory import RunDir
 from slamcli.stages import STAGES, Stage
 
 IGNORED = {"extract": ("cell",)}  # options that change no byte of the fake's output, for the early cut-off

@@ -6,12 +6,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from slamcli import artifacts, freshness, pipeline
-from slamcli.config import Config
+from slamcli import artifacts
+from slamcli.config.options import Config
 from slamcli.formats.cloud import write_ply
 from slamcli.formats.trajectory import write_tum
 from slamcli.geometry import se3
-from slamcli.rundir import RunDir, outputs
+from slamcli.runs import pipeline, staleness
+from slamcli.runs.run_directory import RunDir, outputs
 from slamcli.schema import FORMAT, Closures, Features, Ground, Map, Timing, Tracks, Trajectory, trajectory
 from slamcli.stages import STAGES
 
@@ -145,13 +146,13 @@ def _map(T_wk: np.ndarray, kf_frame: np.ndarray) -> Map:
 
 
 def _record(run: RunDir, stage: pipeline.Stage, out: Path, frames: int) -> dict:
-    declared = freshness.declared(stage, run.config())
+    declared = staleness.declared(stage, run.config())
     inputs = {need: "sha256:0" if need == "dataset" else run.record(need)["digest"] for need in stage.needs}
     files = outputs(out)
     return {
-        "format": FORMAT, "stage": stage.name, "key": freshness.key(declared, inputs),
+        "format": FORMAT, "stage": stage.name, "key": staleness.key(declared, inputs),
         "config": declared, "inputs": inputs, "outputs": files,
-        "digest": freshness.digest({name: entry["sha256"] for name, entry in files.items()}), "environment": pipeline.environment(),
+        "digest": staleness.digest({name: entry["sha256"] for name, entry in files.items()}), "environment": pipeline.environment(),
         "seconds": 1.5, "cpu_seconds": 2.0, "compile_seconds": 0.0, "fps": frames / 1.5, "peak_rss_mb": 200.0,
         "summary": {"frames": frames}, "warnings": [], "n_warnings": 0,
     }  # fmt: skip

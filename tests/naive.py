@@ -2,7 +2,7 @@
 
 import numpy as np
 
-# --- geometry/voxel.py, geometry/octree.py, mapping/occupancy.py, mapping/fusion.py
+# --- geometry/voxel.py, geometry/octree.py, dense/occupancy.py, dense/voxel_cloud.py, depth/oriented_points.py
 
 
 def interleaved(x: int, y: int, z: int) -> int:
@@ -94,7 +94,7 @@ def voxel_means(values: np.ndarray, weight: np.ndarray, side: float) -> dict[tup
     return {cell: np.average(values[rows], axis=0, weights=weight[rows]) for cell, rows in groups.items()}
 
 
-# --- mapping/patches.py, mapping/grid.py, mapping/planner.py
+# --- navigation/surface_patches.py, navigation/grid.py, navigation/planner.py
 
 
 def block_points(depth: np.ndarray, rays: np.ndarray, side: int, max_range: float) -> np.ndarray:
@@ -204,7 +204,7 @@ def cheapest_cost(cost: np.ndarray, start: tuple[int, int], goal: tuple[int, int
             return float(total[goal])
 
 
-# --- mapping/minimal.py, mapping/pose_kernels.py, mapping/bundle_kernels.py
+# --- estimation/minimal_solvers.py, estimation/pose_kernels.py, estimation/bundle_kernels.py
 
 
 def p3p_distances(x: np.ndarray, ray: np.ndarray) -> list[np.ndarray]:

@@ -6,7 +6,7 @@ import numpy as np
 from scenes import CAMERA
 
 from slamcli import artifacts
-from slamcli.config import LoopConfig, OptimizeConfig, SensorConfig, TrackConfig
+from slamcli.config.options import LoopConfig, OptimizeConfig, SensorConfig, TrackConfig
 from slamcli.files import read_json
 from slamcli.geometry.camera import Camera
 from slamcli.schema import CoarseDepth, Features, Map, Matches, Tracks, Words

@@ -10,7 +10,7 @@ import pytest
 from numba import njit
 
 from slamcli import console
-from slamcli.meter import Meter
+from slamcli.runs.cost_meter import Meter
 
 
 class Terminal(io.StringIO):

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from click.testing import Result
 
-from slamcli.rundir import RunDir
+from slamcli.runs.run_directory import RunDir
 from slamcli.stages import NAMES
 
 FILES = {

@@ -13,7 +13,7 @@ from slamcli.cli.common import json_option, run_option
 if TYPE_CHECKING:
     import numpy as np
 
-    from slamcli.rundir import RunDir
+    from slamcli.runs.run_directory import RunDir
     from slamcli.schema import Trajectory
 
 APE_COLUMNS = {
@@ -81,13 +81,13 @@ def ape_command(
       slamcli eval ape runs/a runs/b --style latex   several in one table
       slamcli eval ape --other ORB-SLAM3=f.txt --plot ape.png
     """
-    from slamcli import evaluate, plots, tables
+    from slamcli.evaluation import plots, tables, trajectory_error
 
     results = []
     for folder in _open_runs(runs, run):
-        truth, n_frames = evaluate.ground_truth(folder), len(_frame_stamp(folder))
+        truth, n_frames = trajectory_error.ground_truth(folder), len(_frame_stamp(folder))
         for name, which, estimate in _trajectories(folder, stage, other):
-            results.append(evaluate.ape(estimate, truth, n_frames=n_frames, name=name, stage=which))
+            results.append(trajectory_error.ape(estimate, truth, n_frames=n_frames, name=name, stage=which))
             if which:
                 _record(folder, "ape.json", results[-1].to_dict())
     if plot is not None:
@@ -104,14 +104,14 @@ def rpe_command(
     seconds: float,
 ) -> None:  # fmt: skip
     """Relative pose error: drift over one second, and from one frame to the next."""
-    from slamcli import evaluate, plots, tables
+    from slamcli.evaluation import plots, tables, trajectory_error
 
     results, rows = [], []
     for folder in _open_runs(runs, run):
-        truth, frame_stamp = evaluate.ground_truth(folder), _frame_stamp(folder)
+        truth, frame_stamp = trajectory_error.ground_truth(folder), _frame_stamp(folder)
         for name, which, estimate in _trajectories(folder, stage, other):
             over_time, per_frame = (
-                evaluate.rpe(estimate, truth, frame_stamp=frame_stamp, name=name, stage=which, seconds=interval)
+                trajectory_error.rpe(estimate, truth, frame_stamp=frame_stamp, name=name, stage=which, seconds=interval)
                 for interval in (seconds, None)
             )
             results.append(over_time)
@@ -132,13 +132,14 @@ def map_command(run: str | None, as_json: bool) -> None:
 
     The first replays the key frames and counts the cells of the octree whose state agrees, as OctoMap's eval_octree_accuracy does.
     """
-    from slamcli import console, evaluate_map
-    from slamcli.rundir import RunDir
+    from slamcli import console
+    from slamcli.evaluation import map_error
+    from slamcli.runs.run_directory import RunDir
 
     folder = RunDir.find(run)
-    figures: dict[str, Any] = {"octree": evaluate_map.octree_accuracy(folder, progress=console.progress)}
-    if folder.record("grid2d") is not None and evaluate_map.has_scene(folder):
-        figures["grid"] = evaluate_map.grid_score(folder, progress=console.progress)
+    figures: dict[str, Any] = {"octree": map_error.octree_accuracy(folder, progress=console.progress)}
+    if folder.record("grid2d") is not None and map_error.has_scene(folder):
+        figures["grid"] = map_error.grid_score(folder, progress=console.progress)
     _record(folder, "map.json", figures)
     click.echo(_json([figures]) if as_json else "\n".join(_map_lines(figures)))
 
@@ -161,7 +162,7 @@ def _map_lines(figures: dict[str, Any]) -> list[str]:
 
 
 def _open_runs(runs: tuple[str, ...], run: str | None) -> list[RunDir]:
-    from slamcli.rundir import RunDir
+    from slamcli.runs.run_directory import RunDir
 
     if runs and run is not None:
         raise click.UsageError("name runs either as arguments or with -r, not both")
@@ -170,7 +171,7 @@ def _open_runs(runs: tuple[str, ...], run: str | None) -> list[RunDir]:
 
 def _label(folder: RunDir) -> str:
     """Name a run in a table: its place below runs/, which tells two runs of one recording apart."""
-    from slamcli.rundir import RUNS
+    from slamcli.runs.run_directory import RUNS
 
     path = folder.path.resolve()
     return path.relative_to(RUNS.resolve()).as_posix() if path.is_relative_to(RUNS.resolve()) else path.name
@@ -184,12 +185,12 @@ def _frame_stamp(folder: RunDir) -> np.ndarray:
 
 def _trajectories(folder: RunDir, stage: str | None, other: tuple[str, ...]) -> list[tuple[str, str, Trajectory]]:
     """Give (name, stage, trajectory) of the run's stages asked for, then of other systems, whose stage is ""."""
-    from slamcli import evaluate
+    from slamcli.evaluation import trajectory_error
     from slamcli.formats.trajectory import read_tum
 
-    last = evaluate.last_stage(folder)
-    stages = evaluate.STAGES[: evaluate.STAGES.index(last) + 1] if stage == "all" else (stage or last,)
-    found = [(_label(folder), which, evaluate.stage_trajectory(folder, which)) for which in stages]
+    last = trajectory_error.last_stage(folder)
+    stages = trajectory_error.STAGES[: trajectory_error.STAGES.index(last) + 1] if stage == "all" else (stage or last,)
+    found = [(_label(folder), which, trajectory_error.stage_trajectory(folder, which)) for which in stages]
     for item in other:
         name, equals, file = item.partition("=")
         if not (name and equals and file):

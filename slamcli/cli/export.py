@@ -17,13 +17,13 @@ from slamcli.cli.common import run_option
 @click.option("--format", "layout", type=click.Choice(["tum", "kitti"]), default="tum", show_default=True, help="kitti has no time stamps.")
 def export_trajectory(out: Path, run: str | None, stage: str | None, frame: str, layout: str) -> None:
     """Write the camera's trajectory: pose of the colour camera, camera to world."""
-    from slamcli import evaluate
+    from slamcli.evaluation import trajectory_error
     from slamcli.formats.trajectory import write_kitti, write_tum
-    from slamcli.rundir import RunDir
+    from slamcli.runs.run_directory import RunDir
     from slamcli.schema import Features, Ground, Trajectory
 
     folder = RunDir.find(run)
-    trajectory = evaluate.stage_trajectory(folder, stage or evaluate.last_stage(folder))
+    trajectory = trajectory_error.stage_trajectory(folder, stage or trajectory_error.last_stage(folder))
     if frame == "level":
         ground = folder.load(Ground, "densify")
         if not ground.is_found:

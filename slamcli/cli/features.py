@@ -26,7 +26,7 @@ def inspect_features(recording: str, frame: int, out: Path, data: str | None, fe
 
     from slamcli.datasets import open_dataset
     from slamcli.errors import SlamError
-    from slamcli.rundir import RunDir
+    from slamcli.runs.run_directory import RunDir
     from slamcli.vision import comparison, orb
 
     is_run = (Path(recording) / "run.json").is_file()

@@ -13,8 +13,8 @@ from slamcli.cli.common import json_option, run_option
 if TYPE_CHECKING:
     import numpy as np
 
-    from slamcli.mapping.planner import Route
-    from slamcli.rundir import RunDir
+    from slamcli.navigation.planner import Route
+    from slamcli.runs.run_directory import RunDir
     from slamcli.schema import Grid
 
 
@@ -45,7 +45,7 @@ def export_grid(out: Path, run: str | None, png: Path | None) -> None:
       slamcli export-grid map.pgm --png map.png
     """
     from slamcli.formats import grid_map
-    from slamcli.rundir import RunDir
+    from slamcli.runs.run_directory import RunDir
     from slamcli.schema import Grid
 
     folder = RunDir.find(run)
@@ -53,7 +53,7 @@ def export_grid(out: Path, run: str | None, png: Path | None) -> None:
     warn_without_floor(folder)
     written: tuple[Path, ...] = grid_map.write(out, grid_map.GridMap(grid.state, tuple(grid.origin.tolist()), float(grid.resolution)))
     if png is not None:
-        from slamcli.grid_picture import save_picture
+        from slamcli.visualization.grid_picture import save_picture
 
         save_picture(png, grid, trajectory=camera_path(folder), title=str(folder.info()["dataset"]))
         written = (*written, png)
@@ -85,10 +85,10 @@ def plan(
       slamcli plan --start 0.5,1.0 --goal 3,2
       slamcli plan --start 0.5,1.0 --goal 3,2 -o path.json --png path.png
     """
-    from slamcli.grid_picture import save_picture
-    from slamcli.mapping import planner
-    from slamcli.rundir import RunDir
+    from slamcli.navigation import planner
+    from slamcli.runs.run_directory import RunDir
     from slamcli.schema import Grid
+    from slamcli.visualization.grid_picture import save_picture
 
     trajectory = None
     if page is None:

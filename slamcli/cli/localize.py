@@ -27,8 +27,8 @@ def localize(run: str, recording: str, out: Path, data: str | None, as_json: boo
     from slamcli import console
     from slamcli.datasets import open_dataset
     from slamcli.formats.trajectory import write_tum
-    from slamcli.localisation import localise
-    from slamcli.rundir import RunDir
+    from slamcli.runs.localization import localise
+    from slamcli.runs.run_directory import RunDir
 
     folder = RunDir.find(run)
     dataset = open_dataset(recording, data=data, camera=dict(folder.config().camera) or None, progress=console.progress)

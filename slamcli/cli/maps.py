@@ -14,8 +14,8 @@ from slamcli.errors import SlamError
 if TYPE_CHECKING:
     import numpy as np
 
-    from slamcli.render import View
-    from slamcli.rundir import RunDir
+    from slamcli.runs.run_directory import RunDir
+    from slamcli.visualization.render import View
 
 out_argument = click.argument("out", type=click.Path(path_type=Path, dir_okay=False))
 
@@ -33,7 +33,7 @@ def export_cloud(out: Path, run: str | None, frame: str) -> None:
     """
     from slamcli.formats import cloud
     from slamcli.geometry import se3
-    from slamcli.rundir import RunDir
+    from slamcli.runs.run_directory import RunDir
     from slamcli.schema import Ground
 
     _check_suffix(out, ".ply", ".pcd")
@@ -58,7 +58,7 @@ def export_octree(out: Path, run: str | None, colour: bool) -> None:
       slamcli export-octree map.bt
       slamcli export-octree map.ot --colour
     """
-    from slamcli.rundir import RunDir
+    from slamcli.runs.run_directory import RunDir
 
     suffix, folder = _check_suffix(out, ".bt", ".ot"), RunDir.find(run)
     if colour:
@@ -92,9 +92,9 @@ def export_mesh(out: Path, run: str | None, voxel: float) -> None:
     from dataclasses import replace
 
     from slamcli import console
+    from slamcli.dense.tsdf import Volume
     from slamcli.formats.cloud import write_ply_mesh
-    from slamcli.mapping.tsdf import Volume
-    from slamcli.rundir import RunDir
+    from slamcli.runs.run_directory import RunDir
     from slamcli.schema import Ground
     from slamcli.stages import densify
 
@@ -136,8 +136,8 @@ def render_command(out: Path, run: str | None, what: str, azimuth: float, elevat
     """
     import cv2
 
-    from slamcli import render
-    from slamcli.rundir import RunDir
+    from slamcli.runs.run_directory import RunDir
+    from slamcli.visualization import render
 
     _check_suffix(out, ".png", ".jpg")
     folder = RunDir.find(run)
@@ -151,16 +151,16 @@ def render_command(out: Path, run: str | None, what: str, azimuth: float, elevat
 
 
 def _draw_cloud(folder: RunDir, view: View, path: np.ndarray | None) -> np.ndarray:
-    from slamcli import render
     from slamcli.formats import cloud
+    from slamcli.visualization import render
 
     xyz, rgb, normal = cloud.read_ply(folder.stage_path("densify", "cloud.ply"))
     return render.draw_cloud(xyz, rgb, normal, spacing=folder.config().densify.voxel, view=view, path=path)
 
 
 def _draw_octree(folder: RunDir, view: View, path: np.ndarray | None) -> np.ndarray:
-    from slamcli import render
     from slamcli.formats import octomap
+    from slamcli.visualization import render
 
     return render.draw_octree(octomap.read(folder.stage_path("octree", "map.ot")), view=view, path=path)
 

@@ -13,11 +13,11 @@ from slamcli.cli.common import config_option, json_option, run_option, set_optio
 from slamcli.stages import NAMES, STAGES, Stage
 
 if TYPE_CHECKING:
-    from slamcli.config import Config
+    from slamcli.config.options import Config
     from slamcli.datasets import Dataset
-    from slamcli.freshness import State
-    from slamcli.pipeline import Pipeline
-    from slamcli.rundir import RunDir
+    from slamcli.runs.pipeline import Pipeline
+    from slamcli.runs.run_directory import RunDir
+    from slamcli.runs.staleness import State
 
 STAGE = click.Choice(NAMES)
 
@@ -51,13 +51,14 @@ def run_command(
       slamcli run tum/fr1_room -s extract.features=1500
       slamcli run path/to/recording -r runs/mine --config accurate
     """
-    from slamcli import config_io, console
-    from slamcli.outcome import outcome
-    from slamcli.rundir import RunDir
+    from slamcli import console
+    from slamcli.config import toml
+    from slamcli.runs.run_directory import RunDir
+    from slamcli.runs.summary import outcome
 
     if target is None:
         rundir, dataset = RunDir.find(run), None
-        config = config_io.resolve(rundir.config(), config_name, assignments)
+        config = toml.resolve(rundir.config(), config_name, assignments)
     else:
         rundir, dataset, config = _run_of(target, run, data, config_name, assignments)
     with _writing(rundir, config, dataset) as pipeline:
@@ -72,15 +73,15 @@ def _run_of(
     target: str, run: str | None, data: str | None, config_name: str | None, assignments: tuple[str, ...]
 ) -> "tuple[RunDir, Dataset, Config]":
     """Open the recording and make or open its run."""
-    from slamcli import config_io
-    from slamcli.rundir import RunDir, default_path
+    from slamcli.config import toml
+    from slamcli.runs.run_directory import RunDir, default_path
 
     named = run or os.environ.get("SLAMCLI_RUN")
-    config = config_io.resolve(RunDir(Path(named)).config() if named else None, config_name, assignments)
+    config = toml.resolve(RunDir(Path(named)).config() if named else None, config_name, assignments)
     dataset = _open(target, data, config)
     path = Path(named) if named else default_path(dataset.name)
     camera = config.camera
-    config = config_io.resolve(RunDir(path).config(), config_name, assignments)
+    config = toml.resolve(RunDir(path).config(), config_name, assignments)
     if config.camera != camera:  # only now is it known that an earlier command gave this run another camera
         dataset = _open(target, data, config)
     rundir = RunDir.create(path, dataset=dataset.name, root=str(dataset.root.resolve()), digest=dataset.digest())
@@ -98,7 +99,7 @@ def _open(target: str, data: str | None, config: "Config") -> "Dataset":
 def _writing(rundir: "RunDir", config: "Config", dataset: "Dataset | None" = None) -> "Iterator[Pipeline]":
     """Lock the run, log to its file, and make `config` its configuration."""
     from slamcli import console
-    from slamcli.pipeline import Pipeline
+    from slamcli.runs.pipeline import Pipeline
 
     with rundir.lock(), console.log_file(rundir.path / "log.txt"):
         rundir.write_config(config)
@@ -110,11 +111,11 @@ def _stage_command(stage: Stage) -> click.Command:
     @run_option
     @set_option
     def command(run: str | None, assignments: tuple[str, ...]) -> None:
-        from slamcli import config_io
-        from slamcli.rundir import RunDir
+        from slamcli.config import toml
+        from slamcli.runs.run_directory import RunDir
 
         rundir = RunDir.find(run)
-        with _writing(rundir, config_io.apply(rundir.config(), assignments)) as pipeline:
+        with _writing(rundir, toml.apply(rundir.config(), assignments)) as pipeline:
             pipeline.run_alone(stage.name)
 
     return command
@@ -140,12 +141,12 @@ def status_command(run: str | None, config_name: str | None, assignments: tuple[
 
     With -s or --config it shows what such a change would make stale, and changes nothing.
     """
-    from slamcli import config_io
-    from slamcli.pipeline import Pipeline
-    from slamcli.rundir import RunDir
+    from slamcli.config import toml
+    from slamcli.runs.pipeline import Pipeline
+    from slamcli.runs.run_directory import RunDir
 
     rundir = RunDir.find(run)
-    pipeline = Pipeline(rundir, config_io.resolve(rundir.config(), config_name, assignments))
+    pipeline = Pipeline(rundir, toml.resolve(rundir.config(), config_name, assignments))
     states = pipeline.states(verify=verify)
     if as_json:
         click.echo(json.dumps([_state_object(state) for state in states.values()], indent=1))
@@ -187,11 +188,11 @@ def config_command(
       slamcli config --explain track
       slamcli config extract.features
     """
-    from slamcli import config_io
-    from slamcli.config import Config
-    from slamcli.rundir import LATEST, RunDir
+    from slamcli.config import toml
+    from slamcli.config.options import Config
+    from slamcli.runs.run_directory import LATEST, RunDir
 
     has_run = run or os.environ.get("SLAMCLI_RUN") or LATEST.exists()
     base = RunDir.find(run).config() if has_run and not defaults else Config()
-    config = config_io.resolve(base, config_name, assignments)
-    click.echo(config_io.dump(config, explain=explain, only=names), nl=False)
+    config = toml.resolve(base, config_name, assignments)
+    click.echo(toml.dump(config, explain=explain, only=names), nl=False)

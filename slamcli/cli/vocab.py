@@ -47,13 +47,14 @@ def train(
     """Train a vocabulary on SOURCES, folders of pictures or recordings, and write it to OUT (.npz)."""
     import numpy as np
 
-    from slamcli import console, training
+    from slamcli import console
     from slamcli.errors import SlamError
+    from slamcli.runs import vocabulary_training
     from slamcli.vision import kmeans, vocabulary
 
     if not out.absolute().parent.is_dir():
         raise SlamError(f"{out}: its folder is not there; make it first, training takes minutes")
-    descriptors = training.descriptors(sources, features=features, every=every, progress=console.progress)
+    descriptors = vocabulary_training.descriptors(sources, features=features, every=every, progress=console.progress)
     names = ", ".join(Path(source).name for source in sources)
     made = kmeans.train(
         descriptors,

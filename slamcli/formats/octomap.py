@@ -12,7 +12,7 @@ import numpy as np
 from slamcli.errors import SlamError
 from slamcli.geometry import voxel
 from slamcli.geometry.octree import DEPTH, Level, Octree, levels, preorder, prune
-from slamcli.kernels import kernel
+from slamcli.jit.kernel import kernel
 
 MAGIC = {".ot": b"# Octomap OcTree file", ".bt": b"# Octomap OcTree binary file"}
 NODE = np.dtype([("log_odds", "<f4"), ("children", "u1")])

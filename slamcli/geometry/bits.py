@@ -3,7 +3,7 @@
 from numba import types
 from numba.extending import intrinsic
 
-from slamcli.kernels import kernel
+from slamcli.jit.kernel import kernel
 
 
 @intrinsic

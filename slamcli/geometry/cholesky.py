@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from slamcli.kernels import kernel
+from slamcli.jit.kernel import kernel
 
 
 @kernel(error_model="numpy", fastmath={"contract"})

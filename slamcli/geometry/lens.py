@@ -2,7 +2,7 @@
 
 from numba import f8
 
-from slamcli.kernels import kernel
+from slamcli.jit.kernel import kernel
 
 ROUNDS = 20  # at most; freiburg1's lens, the strongest known here, takes four in its corners
 SMALL = 1e-20  # squared step at which a point is found: 1e-10 of the focal length

@@ -7,7 +7,7 @@ on the left: ``T <- exp(xi) @ T``. Every function takes stacks: (..., 4, 4) matr
 import numpy as np
 
 from slamcli.errors import SlamError
-from slamcli.kernels import kernel
+from slamcli.jit.kernel import kernel
 
 SMALL_ANGLE = 1e-4  # [rad] below this the series in phi^2 are exact to double precision after two terms
 

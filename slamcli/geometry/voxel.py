@@ -8,7 +8,7 @@ import numpy as np
 from numba import i4, i8
 
 from slamcli.errors import SlamError
-from slamcli.kernels import kernel
+from slamcli.jit.kernel import kernel
 
 AXIS_BITS = 21  # per axis in a Morton key
 GOLDEN = -7046029254386353131  # 2^64 / golden ratio as int64: Fibonacci hashing, Knuth, TAOCP 3, section 6.4

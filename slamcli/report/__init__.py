@@ -3,13 +3,14 @@
 from pathlib import Path
 
 from slamcli import files
-from slamcli.report import collect, page, pictures
-from slamcli.rundir import RunDir
+from slamcli.evaluation import run_content
+from slamcli.report import page, pictures
+from slamcli.runs.run_directory import RunDir
 
 __all__ = ["make"]
 
 
 def make(run: RunDir, out: Path) -> None:
     """Write the page of `run` to `out`; SlamError when no stage has made a trajectory yet."""
-    content = collect.collect(run)
+    content = run_content.collect(run)
     files.write_text(out, page.render(content, pictures.draw(run, content)))

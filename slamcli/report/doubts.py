@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slamcli.freshness import MISSING
-from slamcli.report.collect import Content
+from slamcli.evaluation.run_content import Content
+from slamcli.runs.staleness import MISSING
 from slamcli.schema import LOST, ON_SHAPE, RELOCALISED, TRACKED
 
 GOOD, NOTE, BAD = "good", "note", "bad"

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 
 from slamcli import __version__
-from slamcli.config import Config
-from slamcli.evaluate import Ape
+from slamcli.config.options import Config
+from slamcli.evaluation.run_content import Content
+from slamcli.evaluation.trajectory_error import Ape
 from slamcli.report import doubts
-from slamcli.report.collect import Content
 from slamcli.report.pictures import Picture
 
 MOST_TRUTH_POINTS = 6000

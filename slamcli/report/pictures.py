@@ -7,14 +7,14 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from slamcli import grid_picture, render
 from slamcli.errors import SlamError
+from slamcli.evaluation.run_content import Content
 from slamcli.formats import cloud, octomap
-from slamcli.mapping import planner
-from slamcli.mapping.planner import Route
-from slamcli.report.collect import Content
-from slamcli.rundir import RunDir
+from slamcli.navigation import planner
+from slamcli.navigation.planner import Route
+from slamcli.runs.run_directory import RunDir
 from slamcli.schema import Features, Grid
+from slamcli.visualization import grid_picture, render
 
 VIEW = render.View(width=1200, height=800)
 MOST_POINTS = 3_000_000  # of a cloud that is drawn

@@ -8,11 +8,14 @@ from typing import Any
 import numpy as np
 
 from slamcli.artifacts import save
-from slamcli.config import DensifyConfig, SensorConfig
+from slamcli.calibration import rolling_shutter
+from slamcli.config.options import DensifyConfig, SensorConfig
+from slamcli.dense import voxel_cloud
+from slamcli.depth import oriented_points
 from slamcli.errors import BadFrame
 from slamcli.formats.cloud import write_ply, write_ply_mesh
 from slamcli.geometry.camera import Camera
-from slamcli.mapping import fusion, ground, timing
+from slamcli.navigation import floor
 from slamcli.parallel import ordered_map
 from slamcli.schema import Features, Map, Timing, Tracks, frame_poses
 
@@ -39,34 +42,34 @@ def run(inputs: Any, out: Path, cfg: Any, tools: Any) -> dict:
             if n_used % every == 0:
                 yield view.depth, view.T_wk
 
-    floor = ground.find_ground(frames(), camera, T_wc=FIRST_CAMERA, settings=cfg.ground, rng=tools.rng())
-    if not floor.is_found:
+    ground = floor.find_ground(frames(), camera, T_wc=FIRST_CAMERA, settings=cfg.ground, rng=tools.rng())
+    if not ground.is_found:
         tools.warn("no floor was found: the level frame is the first camera's, turned to z up")
     if option.method == "tsdf":
-        cloud = model_w.mesh().moved(floor.T_lw)
+        cloud = model_w.mesh().moved(ground.T_lw)
         write_ply_mesh(out / "mesh.ply", cloud.xyz, cloud.triangle, cloud.rgb, cloud.normal)
     else:
         cloud = model_w.cloud(min_points=option.min_points, neighbours=option.neighbours, max_deviation=option.max_deviation)
-        cloud = cloud.moved(floor.T_lw)
+        cloud = cloud.moved(ground.T_lw)
     if not len(cloud.xyz):
         tools.warn("the cloud is empty: no key frame has depth within densify.depth_max")
     write_ply(out / "cloud.ply", cloud.xyz, cloud.rgb, cloud.normal)
-    save(floor, out)
+    save(ground, out)
     return {
         "frames": len(inputs.dataset),
         "key_frames": len(poses),
         "used": n_used,
         "points": len(cloud.xyz),
-        "is_floor_found": bool(floor.is_found),
+        "is_floor_found": bool(ground.is_found),
     }
 
 
 def _model(camera: Camera, option: DensifyConfig) -> Any:
     if option.method == "tsdf":
-        from slamcli.mapping.tsdf import Volume
+        from slamcli.dense.tsdf import Volume
 
         return Volume(camera, voxel=option.voxel, depth_max=option.depth_max)
-    return fusion.VoxelCloud(option.voxel)
+    return voxel_cloud.VoxelCloud(option.voxel)
 
 
 def depth_poses(inputs: Any, *, frames: str = "key") -> list[tuple[int, np.ndarray]]:
@@ -79,7 +82,7 @@ def depth_poses(inputs: Any, *, frames: str = "key") -> list[tuple[int, np.ndarr
     T_wc = frame_poses(inputs.load(Tracks, "loop"), map_)
     is_main = map_.kf_segment == 0
     T_wc[map_.kf_frame[is_main]] = map_.T_wk[is_main]
-    T_wd = timing.depth_poses(features.stamp, features.depth_stamp + float(when.depth_delay), T_wc)
+    T_wd = rolling_shutter.depth_poses(features.stamp, features.depth_stamp + float(when.depth_delay), T_wc)
     chosen = map_.kf_frame[is_main] if frames == "key" else np.flatnonzero(np.isfinite(T_wd[:, 0, 0]))
     return [(int(frame), T_wd[frame]) for frame in chosen]
 
@@ -90,7 +93,7 @@ class View:
 
     T_wk: np.ndarray  # (4, 4) camera to world
     depth: np.ndarray  # (H, W) float32 [m]
-    seen: fusion.Surface
+    seen: oriented_points.Surface
     rgb: np.ndarray  # (H, W, 3) uint8
 
 
@@ -113,7 +116,7 @@ def views(
             depth = dataset.depth(frame, camera)
             if depth is None:
                 return None
-            seen = fusion.surface(
+            seen = oriented_points.surface(
                 depth,
                 camera,
                 settings=option,

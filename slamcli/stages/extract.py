@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 
 from slamcli import artifacts
-from slamcli.config import ExtractConfig
+from slamcli.config.options import ExtractConfig
 from slamcli.datasets import Dataset
+from slamcli.depth import at_key_points, icp
 from slamcli.errors import BadFrame, SlamError
 from slamcli.geometry.camera import Camera
-from slamcli.mapping import surface
 from slamcli.parallel import ordered_map
 from slamcli.schema import CoarseDepth, Features, Flow
-from slamcli.vision import depth_reading, flow, orb
+from slamcli.vision import optical_flow, orb
 
 
 @dataclass(frozen=True)
@@ -77,10 +77,10 @@ def _extract(dataset: Dataset, settings: ExtractConfig, i: int) -> _Frame:
     if depth is None:
         nowhere = np.full(len(points), np.nan, np.float32)
         return _Frame(points, nowhere, slope=np.zeros((len(points), 2), np.float32), coarse=None, faults=faults)
-    read = depth_reading.depth_at(depth, points.xy, window=settings.depth_window)
+    read = at_key_points.depth_at(depth, points.xy, window=settings.depth_window)
     if settings.depth_jump:
-        read = np.where(depth_reading.is_behind_outline(depth, points.xy, jump=settings.depth_jump), np.float32(np.nan), read)
-    return _Frame(points, read, depth_reading.inverse_depth_slope(depth, points.xy), surface.coarse(depth), faults)
+        read = np.where(at_key_points.is_behind_outline(depth, points.xy, jump=settings.depth_jump), np.float32(np.nan), read)
+    return _Frame(points, read, at_key_points.inverse_depth_slope(depth, points.xy), icp.coarse(depth), faults)
 
 
 def detect(grey: np.ndarray, settings: ExtractConfig) -> orb.KeyPoints:
@@ -124,7 +124,7 @@ def _table(dataset: Dataset, camera: Camera, found: list[_Frame], scale: float) 
 
 
 def _coarse_table(camera: Camera, found: list[_Frame]) -> CoarseDepth:
-    coarse = np.zeros((len(found), *surface.coarse_shape(camera)), dtype=np.uint16)
+    coarse = np.zeros((len(found), *icp.coarse_shape(camera)), dtype=np.uint16)
     for i, frame in enumerate(found):
         if frame.coarse is not None:
             coarse[i] = frame.coarse
@@ -138,7 +138,7 @@ def _flow_table(dataset: Dataset, camera: Camera, found: list[_Frame], tools) ->
         xy, n = found[i].points.xy, len(found)
         if i + 1 == n or len(xy) == 0 or len(found[i + 1].points) == 0:
             return np.full((len(xy), 2), np.nan, np.float32)
-        return flow.follow(dataset.grey(i), dataset.grey(i + 1), xy)
+        return optical_flow.follow(dataset.grey(i), dataset.grey(i + 1), xy)
 
     followed = ordered_map(follow, range(len(found)), workers=tools.workers)
     raw = np.concatenate(list(tools.progress(followed, "flow", len(found))))

@@ -8,8 +8,8 @@ import numpy as np
 from slamcli.artifacts import save
 from slamcli.errors import BadFrame
 from slamcli.formats import grid_map, octomap
-from slamcli.mapping import grid
-from slamcli.mapping.views import View, look
+from slamcli.navigation import grid
+from slamcli.navigation.grid_evidence import View, look
 from slamcli.parallel import ordered_map
 from slamcli.schema import Features, Grid, Ground
 from slamcli.stages.densify import depth_poses
@@ -23,7 +23,7 @@ def run(inputs: Any, out: Path, cfg: Any, tools: Any) -> dict:
         tools.warn("no floor was found: heights are measured from the first camera, so the grid is not fit to drive on")
     summary: dict[str, Any] = {"frames": len(inputs.dataset)}
     if cfg.grid2d.source == "octree":
-        from slamcli.mapping.grid_octree import grid_from_octree
+        from slamcli.navigation.grid_from_octree import grid_from_octree
 
         made = grid_from_octree(octomap.read(inputs.path("octree", "map.ot")), settings=cfg.grid2d)
     else:

@@ -7,13 +7,16 @@ from pathlib import Path
 import numpy as np
 
 from slamcli import artifacts
+from slamcli.calibration import self_calibration
+from slamcli.calibration.self_calibration import Sensing
 from slamcli.errors import SlamError
-from slamcli.mapping import adjustment, closure, hindsight, posegraph, segments, selfcalibration
-from slamcli.mapping.closure import Candidate
-from slamcli.mapping.mapbuilder import MapBuilder
-from slamcli.mapping.selfcalibration import Sensing
-from slamcli.mapping.shape import Reliefs
+from slamcli.formats.g2o import write_g2o
 from slamcli.schema import LOST, Closures, CoarseDepth, Features, Map, Timing, Tracks, Words
+from slamcli.slam import final_refinement, loop_closing, map_segments
+from slamcli.slam.depth_tracking import Reliefs
+from slamcli.slam.loop_closing import Candidate
+from slamcli.sparse_map import map_adjustment
+from slamcli.sparse_map.sparse_map import MapBuilder
 from slamcli.stages.extract import write_camera
 from slamcli.stages.track import save_map_stage, segment_file, segments_apart
 
@@ -23,14 +26,14 @@ def run(inputs, out: Path, cfg, tools) -> dict:
     words, tracks = inputs.load(Words, "match"), inputs.load(Tracks, "optimize")
     when, camera = inputs.load(Timing, "optimize"), inputs.camera("optimize")
     given, sensing = inputs.camera(), Sensing(camera, when, {})
-    features = selfcalibration.correct(inputs.load(Features, "extract"), given, sensing)
+    features = self_calibration.correct(inputs.load(Features, "extract"), given, sensing)
     builder = MapBuilder.from_map(features, inputs.load(Map, "optimize"))
     tried: list[Candidate] = []
     if cfg.loop.enabled and len(builder.kf) > 2:
         tried = close_loops(builder, words, camera, cfg, tools)
     accepted = [c for c in tried if c.is_accepted]
     if accepted and cfg.loop.hindsight:
-        tracks, _ = hindsight.look_again(
+        tracks, _ = final_refinement.look_again(
             builder,
             tracks,
             sensing,
@@ -42,8 +45,8 @@ def run(inputs, out: Path, cfg, tools) -> dict:
             iterations=cfg.loop.iterations,
             progress=tools.progress,
         )
-    map_ = segments.anchored(main_first(builder.snapshot(), tracks, cfg.loop.main_segment), tracks)
-    write_pose_graph(out / "posegraph.g2o", map_.T_wk, closure.pose_graph(builder, accepted, cfg.loop))
+    map_ = map_segments.anchored(main_first(builder.snapshot(), tracks, cfg.loop.main_segment), tracks)
+    write_pose_graph(out / "posegraph.g2o", map_.T_wk, loop_closing.build_pose_graph(builder, accepted, cfg.loop))
     write_candidates(out / "candidates.csv", tried)
     for segment, told in enumerate(segments_apart(tracks, map_), start=1):
         tools.warn(f"{told}, could not be joined: their poses, in a frame of their own, are in {segment_file(segment)}; no map shows them")
@@ -56,7 +59,7 @@ def run(inputs, out: Path, cfg, tools) -> dict:
         "frames": len(features.stamp),
         "candidates": len(tried),
         "closures": len(accepted),
-        "segments": segments.n_segments(map_),
+        "segments": map_segments.n_segments(map_),
         "lost": int((tracks.state == LOST).sum()),
         "landmarks": len(map_.lm_xyz),
     }
@@ -64,21 +67,21 @@ def run(inputs, out: Path, cfg, tools) -> dict:
 
 def main_first(map_: Map, tracks: Tracks, main: int) -> Map:
     """Number the segments by size and make the one that was asked for the main one."""
-    map_ = segments.ranked(map_, tracks)  # leaves no gap in the numbers where segments were joined
-    n = max(1, segments.n_segments(map_))
+    map_ = map_segments.ranked(map_, tracks)  # leaves no gap in the numbers where segments were joined
+    n = max(1, map_segments.n_segments(map_))
     if main >= n:
         raise SlamError(f"loop.main_segment = {main}: the map has {n} segment{'s' * (n > 1)}; give a number below {n}")
-    return segments.ranked(map_, tracks, main)
+    return map_segments.ranked(map_, tracks, main)
 
 
 def close_loops(builder: MapBuilder, words: Words, camera, cfg, tools) -> list[Candidate]:
     """Search, verify, correct, fuse, adjust; again while that brings new closures. Returns all candidates with their fate."""
-    recogniser = closure.Recogniser(words, builder.kf.frame)
+    recogniser = loop_closing.Recogniser(words, builder.kf.frame)
     rng = tools.rng()
     fate = join_segments(builder, recogniser, camera, cfg, rng)
     for _ in range(cfg.loop.rounds):
         new = []
-        candidates = closure.find_candidates(builder, recogniser, cfg.loop) + closure.find_near(builder, recogniser, cfg.loop)
+        candidates = loop_closing.find_candidates(builder, recogniser, cfg.loop) + loop_closing.find_near(builder, recogniser, cfg.loop)
         for candidate in tools.progress(candidates, "loop"):
             pair = (candidate.kf_i, candidate.kf_j)
             if are_apart(builder, candidate):
@@ -86,20 +89,20 @@ def close_loops(builder: MapBuilder, words: Words, camera, cfg, tools) -> list[C
             # One closure joins its whole neighbourhood: fusion finds the rest. And where the graph contradicted one, words would only
             # name its like again; what the poses of now name is another idea.
             done = [c for c in fate.values() if c.is_accepted or (c.T_ij is not None and not candidate.is_near)]
-            if any(closure.is_near(candidate, c, span=cfg.loop.closure_spacing) for c in done):
+            if any(loop_closing.is_near(candidate, c, span=cfg.loop.closure_spacing) for c in done):
                 continue
-            fate[pair] = closure.verify(builder, words, candidate, camera, cfg.loop, cfg.sensor, rng)
+            fate[pair] = loop_closing.verify(builder, words, candidate, camera, cfg.loop, cfg.sensor, rng)
             if fate[pair].is_accepted:
                 new.append(fate[pair])
         if not new:
             break
-        graph = closure.close(builder, new, cfg.loop)
+        graph = loop_closing.close(builder, new, cfg.loop)
         is_kept, chi2 = graph.is_kept[-len(new) :], graph.chi2[-len(new) :]
         for c, value in zip(itertools.compress(new, ~is_kept), chi2[~is_kept], strict=True):
-            fate[c.kf_i, c.kf_j] = closure.reject(c, f"the pose graph contradicts it (chi2 {value:.0f})")
+            fate[c.kf_i, c.kf_j] = loop_closing.reject(c, f"the pose graph contradicts it (chi2 {value:.0f})")
         if not is_kept.any():
             break
-        closure.apply(builder, graph.T_wk)
+        loop_closing.apply(builder, graph.T_wk)
         settle(builder, list(itertools.compress(new, is_kept)), camera, cfg)
     return [fate[key] for key in sorted(fate)]
 
@@ -107,10 +110,10 @@ def close_loops(builder: MapBuilder, words: Words, camera, cfg, tools) -> list[C
 def settle(builder: MapBuilder, closures: list[Candidate], camera, cfg) -> None:
     """Fuse what both sides of the closures see, and adjust the whole map."""
     for c in closures:
-        closure.fuse_around(builder, c, camera, cfg.loop, cfg.sensor)
+        loop_closing.fuse_around(builder, c, camera, cfg.loop, cfg.sensor)
     builder.refresh(np.flatnonzero(builder.lm.is_alive).astype(np.int32))
     kfs = np.arange(len(builder.kf), dtype=np.int32)
-    adjustment.adjust(builder, kfs, camera, cfg.sensor, max_iterations=cfg.loop.iterations)
+    map_adjustment.adjust(builder, kfs, camera, cfg.sensor, max_iterations=cfg.loop.iterations)
 
 
 def are_apart(builder: MapBuilder, c: Candidate) -> bool:
@@ -122,18 +125,18 @@ def join_segments(builder: MapBuilder, recogniser, camera, cfg, rng) -> dict[tup
     """Join map segments that saw the same place. Returns the fate of candidates between segments, by pair of key frames."""
     if len(np.unique(builder.kf.segment)) < 2:
         return {}
-    between = [c for c in closure.find_candidates(builder, recogniser, cfg.loop) if are_apart(builder, c)]
-    tried = [closure.verify(builder, recogniser.words, c, camera, cfg.loop, cfg.sensor, rng) for c in between]
+    between = [c for c in loop_closing.find_candidates(builder, recogniser, cfg.loop) if are_apart(builder, c)]
+    tried = [loop_closing.verify(builder, recogniser.words, c, camera, cfg.loop, cfg.sensor, rng) for c in between]
     fate = [c for c in tried if not c.is_accepted]
     left = [c for c in tried if c.is_accepted]
-    while found := segments.find_join(builder, left, least=cfg.loop.join_closures):
-        segments.join(builder, found)
-        settle(builder, closure.spread(found.closures, span=cfg.loop.closure_spacing), camera, cfg)
+    while found := map_segments.find_join(builder, left, least=cfg.loop.join_closures):
+        map_segments.join(builder, found)
+        settle(builder, loop_closing.spread(found.closures, span=cfg.loop.closure_spacing), camera, cfg)
         fate += found.closures
         # What says otherwise is tried again like any loop, now that odometry of a kind runs between the segments.
         left = [c for c in left if are_apart(builder, c)]
     alone = f"closures between the two map segments are fewer than {cfg.loop.join_closures}, or others contradict it"
-    return {(c.kf_i, c.kf_j): c for c in (*fate, *(closure.reject(c, alone) for c in left))}
+    return {(c.kf_i, c.kf_j): c for c in (*fate, *(loop_closing.reject(c, alone) for c in left))}
 
 
 def closures_of(accepted: list[Candidate]) -> Closures:
@@ -155,6 +158,6 @@ def write_candidates(path: Path, candidates: list[Candidate]) -> None:
             writer.writerow([c.kf_i, c.kf_j, f"{c.score:.4f}", c.n_matches, c.n_inliers, int(c.is_accepted), c.reason])
 
 
-def write_pose_graph(path: Path, T_wk: np.ndarray, graph: closure.PoseGraph) -> None:
+def write_pose_graph(path: Path, T_wk: np.ndarray, graph: loop_closing.PoseGraph) -> None:
     """Write the key frames, the edges between them as the final map has them, and the closures as they were measured."""
-    posegraph.write_g2o(path, T_wk, graph.edge_kf, graph.edge_T_ij, graph.information)
+    write_g2o(path, T_wk, graph.edge_kf, graph.edge_T_ij, graph.information)

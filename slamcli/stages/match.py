@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 
 from slamcli import artifacts
-from slamcli.config import MatchConfig
+from slamcli.config.options import MatchConfig
 from slamcli.parallel import ordered_map
 from slamcli.schema import Features, Flow, Matches, Words
-from slamcli.vision import flow, hamming, vocabulary
+from slamcli.vision import hamming, optical_flow, vocabulary
 
 
 def run(inputs, out: Path, cfg, tools) -> dict:
@@ -52,7 +52,7 @@ def _match(
     i, j = (slice(int(features.offset[frame]), int(features.offset[frame + 1])) for frame in pair)
     is_free_i, is_free_j = np.ones(i.stop - i.start, dtype=bool), np.ones(j.stop - j.start, dtype=bool)
     is_free_i[rows[:, 0]] = is_free_j[rows[:, 1]] = False
-    more = flow.match(features.xy[i], flowed[j], is_free_i=is_free_i, is_free_j=is_free_j, radius=settings.flow_radius)
+    more = optical_flow.match(features.xy[i], flowed[j], is_free_i=is_free_i, is_free_j=is_free_j, radius=settings.flow_radius)
     bits = np.unpackbits(features.desc[i][more[:, 0]] ^ features.desc[j][more[:, 1]], axis=1).sum(axis=1)
     return np.concatenate([rows, more]), np.concatenate([distance, bits.clip(0, 255).astype(np.uint8)])
 

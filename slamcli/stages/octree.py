@@ -6,13 +6,14 @@ from typing import Any
 
 import numpy as np
 
-from slamcli.config import OctreeConfig, SensorConfig
+from slamcli.config.options import OctreeConfig, SensorConfig
+from slamcli.dense import change_detection
+from slamcli.dense.occupancy import OccupancyMap, Scan
+from slamcli.depth import oriented_points
 from slamcli.errors import BadFrame
 from slamcli.formats import octomap
 from slamcli.geometry import octree, se3
 from slamcli.geometry.camera import Camera
-from slamcli.mapping import changes, fusion
-from slamcli.mapping.occupancy import OccupancyMap, Scan
 from slamcli.parallel import ordered_map
 from slamcli.schema import Ground
 from slamcli.stages.densify import depth_poses
@@ -60,7 +61,7 @@ def rounds(inputs: Any, grid: OccupancyMap, option: OctreeConfig) -> Iterator[li
     yield [pose for pose in poses if pose[0] in chosen]
     for _ in range(ROUNDS if option.frames == "auto" else 0):
         poses = [pose for pose in poses if pose[0] not in chosen]
-        asked = changes.witnesses(grid, poses, inputs.camera("loop"), max_range=option.max_range, most=n_key_frames)
+        asked = change_detection.witnesses(grid, poses, inputs.camera("loop"), max_range=option.max_range, most=n_key_frames)
         chosen = {frame for frame, _ in asked}
         yield asked
 
@@ -89,7 +90,7 @@ def scans(
             return None
         if depth is None:
             return None
-        seen = fusion.surface(
+        seen = oriented_points.surface(
             depth,
             camera,
             settings=option,

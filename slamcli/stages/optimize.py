@@ -6,12 +6,14 @@ from pathlib import Path
 import numpy as np
 
 from slamcli import artifacts
-from slamcli.mapping import adjustment, hindsight, segments, selfcalibration, timing
-from slamcli.mapping.localiser import NO_RELIEFS
-from slamcli.mapping.mapbuilder import MapBuilder
-from slamcli.mapping.selfcalibration import Sensing
-from slamcli.mapping.shape import Reliefs
+from slamcli.calibration import rolling_shutter, self_calibration
+from slamcli.calibration.self_calibration import Sensing
 from slamcli.schema import CoarseDepth, Features, Map, Timing, Tracks
+from slamcli.slam import final_refinement, map_segments
+from slamcli.slam.depth_tracking import Reliefs
+from slamcli.slam.localizer import NO_RELIEFS
+from slamcli.sparse_map import map_adjustment
+from slamcli.sparse_map.sparse_map import MapBuilder
 from slamcli.stages.extract import write_camera
 from slamcli.stages.track import save_map_stage
 
@@ -21,13 +23,13 @@ def run(inputs, out: Path, cfg, tools) -> dict:
     features, tracks, map_ = inputs.load(Features, "extract"), inputs.load(Tracks, "track"), inputs.load(Map, "track")
     given = inputs.camera()
     delay = np.array(0.0 if cfg.optimize.move_depth else np.nan)
-    still = Timing(np.array(0.0), np.array(0.0), depth_delay=delay, twist=timing.frame_twists(features.stamp, tracks, map_))
+    still = Timing(np.array(0.0), np.array(0.0), depth_delay=delay, twist=rolling_shutter.frame_twists(features.stamp, tracks, map_))
     sensing, summary = Sensing(given, still, {}), {}
     if cfg.optimize.enabled and len(map_.kf_frame) > 1:
         builder = MapBuilder.from_map(features, map_)
         reliefs = Reliefs(inputs.load(CoarseDepth, "extract"), given, cfg.sensor)
         tracks, sensing, summary = refine(builder, features, tracks, sensing, cfg, tools, reliefs=reliefs)
-        map_ = segments.anchored(builder.snapshot(), tracks)
+        map_ = map_segments.anchored(builder.snapshot(), tracks)
     save_map_stage(out, features.stamp, tracks, map_)
     artifacts.save(tracks, out)
     artifacts.save(sensing.timing, out)
@@ -44,18 +46,18 @@ def refine(
     rounds bring both to rest.
     """
     kfs, given, cost = np.arange(len(builder.kf), dtype=np.int32), sensing.camera, []
-    prior = selfcalibration.unknowns(given, cfg.optimize)
+    prior = self_calibration.unknowns(given, cfg.optimize)
     for _ in range(cfg.optimize.rounds if prior else 0):
-        builder.features = selfcalibration.correct(features, given, sensing)
-        result = adjustment.adjust(builder, kfs, sensing.camera, cfg.sensor, max_iterations=cfg.optimize.iterations)
-        found = selfcalibration.estimate_sensing(builder, given, sensing, cfg.sensor, prior=prior)
+        builder.features = self_calibration.correct(features, given, sensing)
+        result = map_adjustment.adjust(builder, kfs, sensing.camera, cfg.sensor, max_iterations=cfg.optimize.iterations)
+        found = self_calibration.estimate_sensing(builder, given, sensing, cfg.sensor, prior=prior)
         if result is None or found is None:
             break
-        twist = timing.frame_twists(features.stamp, tracks, builder.snapshot())
+        twist = rolling_shutter.frame_twists(features.stamp, tracks, builder.snapshot())
         sensing = replace(found, timing=replace(found.timing, twist=twist))
         cost.append(result.cost[-1])
-    builder.features = selfcalibration.correct(features, given, sensing)
-    tracks, result = hindsight.look_again(
+    builder.features = self_calibration.correct(features, given, sensing)
+    tracks, result = final_refinement.look_again(
         builder,
         tracks,
         sensing,
@@ -74,7 +76,7 @@ def told(sensing: Sensing) -> dict:
     """Tell the numbers found with their standard deviations."""
     figures = {}
     for name, sigma in sensing.sigma.items():
-        is_time = name in selfcalibration.TIMES
+        is_time = name in self_calibration.TIMES
         unit = 1e3 if is_time else 1.0
         value = getattr(sensing.timing if is_time else sensing.camera, name)
         figures[f"{name}_ms" if is_time else name] = [float(f"{unit * one:.6g}") for one in (float(value), sigma)]

@@ -7,9 +7,6 @@ import numpy as np
 
 from slamcli import artifacts
 from slamcli.formats import trajectory as trajectory_file
-from slamcli.mapping import segments
-from slamcli.mapping.shape import Reliefs
-from slamcli.mapping.tracker import Tracker
 from slamcli.schema import (
     LOST,
     ON_SHAPE,
@@ -24,6 +21,9 @@ from slamcli.schema import (
     frame_segments,
     trajectory,
 )
+from slamcli.slam import map_segments
+from slamcli.slam.depth_tracking import Reliefs
+from slamcli.slam.tracker import Tracker
 
 
 def run(inputs, out: Path, cfg, tools) -> dict:
@@ -36,7 +36,7 @@ def run(inputs, out: Path, cfg, tools) -> dict:
     for i in tools.progress(range(len(features.stamp)), "track"):
         tracker.process(i)
     tracks = tracker.tracks()
-    map_ = segments.anchored(segments.ranked(tracker.map(), tracks), tracks)
+    map_ = map_segments.anchored(map_segments.ranked(tracker.map(), tracks), tracks)
     lost = lost_spans(tracks.state, tracker.lost_reason)
     for first, last, reason in lost:
         tools.warn(f"frames {first} to {last} are lost: {reason}" if last > first else f"frame {first} is lost: {reason}")
@@ -48,7 +48,7 @@ def run(inputs, out: Path, cfg, tools) -> dict:
         "lost": int((tracks.state == LOST).sum()),
         "relocalised": int((tracks.state == RELOCALISED).sum()),
         "on_shape": int((tracks.state == ON_SHAPE).sum()),
-        "segments": segments.n_segments(map_),
+        "segments": map_segments.n_segments(map_),
         "key_frames": len(map_.kf_frame),
         "landmarks": len(map_.lm_xyz),
         "edges": len(map_.edge_kf),
@@ -64,7 +64,7 @@ def save_map_stage(out: Path, stamp: np.ndarray, tracks: Tracks, map_: Map) -> N
     artifacts.save(map_, out)
     trajectory_file.write_tum(out / "trajectory.txt", trajectory(stamp, tracks, map_))
     trajectory_file.write_tum(out / "keyframes.txt", key_frame_trajectory(stamp, map_))
-    for segment in range(1, segments.n_segments(map_)):
+    for segment in range(1, map_segments.n_segments(map_)):
         trajectory_file.write_tum(out / segment_file(segment), trajectory(stamp, tracks, map_, segment))
 
 
@@ -82,7 +82,7 @@ def key_frame_trajectory(stamp: np.ndarray, map_: Map) -> Trajectory:
 def segments_apart(tracks: Tracks, map_: Map) -> list[str]:
     """Tell which frames belong to other segments than the main one."""
     frames, told = frame_segments(tracks, map_), []
-    for segment in range(1, segments.n_segments(map_)):
+    for segment in range(1, map_segments.n_segments(map_)):
         of = np.flatnonzero(frames == segment)
         told.append(
             f"map segment {segment}, {len(of)} of the frames {of[0]} to {of[-1]}" if len(of) else f"map segment {segment}, no frame"

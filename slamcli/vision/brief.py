@@ -6,7 +6,7 @@ E. Rublee, V. Rabaud, K. Konolige, G. Bradski, ORB: an efficient alternative to 
 import numpy as np
 from numba import f4, i4, i8, int16, int32, u1, u4, uint32, uintp
 
-from slamcli.kernels import kernel
+from slamcli.jit.kernel import kernel
 from slamcli.vision.pattern import PAIRS
 
 PATCH_RADIUS = 15  # [px] of the disc whose centroid gives the orientation

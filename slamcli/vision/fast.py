@@ -9,7 +9,7 @@ import numpy as np
 from numba import f4, f8, i4, i8, int64, types, u1, u8, uint8, uintp
 from numba.extending import intrinsic
 
-from slamcli.kernels import kernel
+from slamcli.jit.kernel import kernel
 from slamcli.vision.pyramid import HEIGHT, TOP, WIDTH, canvas
 
 RADIUS = 3  # [px] of the circle of 16 pixels

@@ -3,7 +3,7 @@
 import numpy as np
 from numba import i8, u1, u2, uint8, uint16, uint32, uintp
 
-from slamcli.kernels import kernel
+from slamcli.jit.kernel import kernel
 from slamcli.vision.pyramid import HEIGHT, TOP, WIDTH
 
 # The 7-tap Gaussian of 2 px in 1/256, as OpenCV rounds it: outermost, ..., centre.

@@ -4,7 +4,7 @@ import numpy as np
 from numba import f4, f8, i4, i8, u4, u8, uint32, uintp
 
 from slamcli.geometry.bits import popcount
-from slamcli.kernels import kernel
+from slamcli.jit.kernel import kernel
 
 BINS = 30  # of the histogram of turns between matched points
 KEPT_BINS = 3

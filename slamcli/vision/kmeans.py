@@ -9,7 +9,7 @@ import numpy as np
 
 from slamcli.errors import SlamError
 from slamcli.geometry.bits import hamming
-from slamcli.kernels import kernel
+from slamcli.jit.kernel import kernel
 from slamcli.vision.vocabulary import MAX_NODES, Vocabulary, check, quantise
 
 

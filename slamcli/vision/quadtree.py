@@ -3,7 +3,7 @@
 import numpy as np
 from numba import f4, i4, i8, u1
 
-from slamcli.kernels import kernel
+from slamcli.jit.kernel import kernel
 
 X0, Y0, X1, Y1, FIRST, COUNT = range(6)  # columns of a node: its box [px], the end excluded; the first of its points; how many they are
 NODE_COLUMNS = 6

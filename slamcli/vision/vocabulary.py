@@ -13,7 +13,7 @@ from numba import f4, f8, i4, i8, u8
 
 from slamcli.errors import SlamError
 from slamcli.geometry.bits import hamming
-from slamcli.kernels import kernel
+from slamcli.jit.kernel import kernel
 
 FORMAT = 1
 MAX_NODES = 4_000_000  # ORB-SLAM's vocabulary has 1.1 million

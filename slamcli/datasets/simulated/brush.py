@@ -10,7 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from slamcli.kernels import kernel
+from slamcli.jit.kernel import kernel
 
 Painter = Callable[[np.random.Generator, float, float, float], np.ndarray]
 Colour = tuple[float, float, float]

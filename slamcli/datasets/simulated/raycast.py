@@ -10,7 +10,7 @@ import numpy as np
 from slamcli.datasets.simulated.atlas import bake_light, build_atlas
 from slamcli.datasets.simulated.scene import Patch, Scene
 from slamcli.geometry.camera import Camera
-from slamcli.kernels import kernel
+from slamcli.jit.kernel import kernel
 from slamcli.open3d_loader import load_open3d
 
 MAX_TAPS = 8  # of the anisotropic filter

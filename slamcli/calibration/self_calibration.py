@@ -1,0 +1,219 @@
+"""What the recording itself says about its camera: numbers that all observations share, found together with the map.
+
+A shared number g moves each measurement by J g. At the optimum of a bundle adjustment, with r the residuals, H and b the normal equations
+of key frames and landmarks and C = J_map^T w J, eliminating the map leaves
+
+    (J^T w J - C^T H^-1 C) g = J^T w r - C^T H^-1 J_map^T w r
+
+which is small, and whose inverse is the covariance of g.
+
+A factor on all depth readings stays as it is believed to be: a world, a path and depths that are all stretched alike show the same
+pictures. An offset of inverse depth, as of a sensor whose disparities are off by a constant, bends the world and is found.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from slamcli.calibration import rolling_shutter
+from slamcli.config.options import OptimizeConfig, SensorConfig
+from slamcli.estimation import bundle_adjustment, bundle_kernels
+from slamcli.geometry.camera import Camera
+from slamcli.schema import Features, Timing
+from slamcli.sparse_map import map_adjustment
+from slamcli.sparse_map.sparse_map import MapBuilder
+
+TIMES = "readout", "depth_readout", "depth_delay"  # fields of Timing that are looked for
+SIGNIFICANT = 3.0  # standard deviations
+STEP = 1e-3  # of its prior sigma, by which an unknown of the calibration is moved to see what that does
+
+
+@dataclass(frozen=True)
+class Shared:
+    """The numbers found and how sure they are."""
+
+    value: np.ndarray  # (G,)
+    sigma: np.ndarray  # (G,) standard deviations
+
+
+@dataclass(frozen=True)
+class Sensing:
+    """Where and when the camera measures, and how sure that is."""
+
+    camera: Camera
+    timing: Timing
+    sigma: dict[str, float]  # of the numbers that were found, by name; before looking, how far they are believed to be off
+
+
+def unknowns(camera: Camera, option: OptimizeConfig) -> dict[str, float]:
+    """Give the numbers to be found, fields of Timing or Camera, and how far each is believed to be from what the recording says."""
+    prior = {}
+    if option.readout:
+        prior["readout"] = option.timing_prior
+    if option.readout and option.move_depth:
+        prior["depth_readout"] = option.timing_prior
+    if option.move_depth and option.depth_delay:
+        prior["depth_delay"] = option.timing_prior
+    if option.intrinsics:
+        prior |= {"fx": option.focal_prior * camera.fx, "fy": option.focal_prior * camera.fy}
+        prior |= {"cx": option.centre_prior, "cy": option.centre_prior}
+    if option.depth_scale:
+        prior |= {"depth_scale": option.depth_scale_prior * camera.depth_scale, "inverse_depth_offset": option.inverse_depth_prior}
+    return prior
+
+
+def correct(features: Features, given: Camera, sensing: Sensing) -> Features:
+    """Give features, measured under the calibration `given`, as they are under what is known of the camera now."""
+    return rolling_shutter.rectify(recalibrate(features, given, sensing.camera), sensing.timing, sensing.camera)
+
+
+def recalibrate(features: Features, given: Camera, camera: Camera) -> Features:
+    """Give features, measured under the calibration `given`, as they are under another one of the same camera."""
+    if camera == given:
+        return features
+    xy = np.empty_like(features.xy)
+    for start in range(0, len(xy), rolling_shutter.ROWS_AT_ONCE):
+        part = slice(start, start + rolling_shutter.ROWS_AT_ONCE)
+        xy[part] = camera.undistort(given.distort(features.xy[part]))
+    slope = features.slope * np.float32(camera.depth_scale / given.depth_scale)
+    return replace(features, xy=xy, depth=camera.reread(features.depth, given), slope=slope)
+
+
+def estimate_sensing(builder: MapBuilder, given: Camera, now: Sensing, sensor: SensorConfig, *, prior: dict[str, float]) -> Sensing | None:
+    """Find the unknowns at an adjusted map whose features were corrected by `now`.
+
+    given : the recording's calibration; prior : as `unknowns` gives it, standard deviations of the timing around 0, of the rest around `given`
+    Returns better numbers, with the same motion, those as before that do not differ significantly; None where the map is not determined.
+    """
+    part = map_adjustment.gather(builder, np.arange(len(builder.kf), dtype=np.int32), sensor)
+    if len(part.row) == 0 or not prior:
+        return None
+    T_kw, x_w = builder.T_kw(part.kfs), builder.lm.xyz[part.ids]
+    problem = bundle_adjustment.Problem(T_kw, x_w, *part.arguments, now.camera, part.is_fixed, part.edges)
+    names = list(prior)
+    predicted = problem.in_given_order(residuals(problem, problem.T, problem.x) + problem.measured[:, :3])
+    # What an offset bends is to turn about readings of this depth, so that it changes no size that the depth scale answers for.
+    pivot = float(np.median(predicted[:, 2]))
+    columns = np.stack([_column(name, builder.features, part.row, predicted, now, prior[name], pivot) for name in names], axis=2)
+    value, centre = (
+        np.array([_number(name, camera, when, pivot) for name in names]) for camera, when in ((now.camera, now.timing), (given, None))
+    )
+    found = estimate(problem, problem.T, problem.x, columns, prior=centre - value, prior_sigma=np.array(list(prior.values())))
+    if found is None:
+        return None
+    value = value + found.value
+    # What cannot be told from what was believed stays so: the noise of its estimate would go into all measurements for nothing.
+    value = np.where(np.abs(value - centre) > SIGNIFICANT * found.sigma, value, centre)
+    better = dict(zip(names, value.tolist(), strict=True))
+    if "depth_scale" in better:
+        better["depth_scale"] *= 1.0 - better["inverse_depth_offset"] * pivot
+    when = {name: np.array(better.pop(name)) for name in TIMES if name in better}
+    return Sensing(replace(now.camera, **better), replace(now.timing, **when), dict(zip(names, found.sigma.tolist(), strict=True)))
+
+
+def _number(name: str, camera: Camera, when: Timing | None, pivot: float) -> float:
+    """Look up an unknown; without timing, what is believed of it before looking. The depth scale is that of readings at depth `pivot` [m]."""
+    if name == "depth_scale":
+        return camera.depth_scale / (1.0 - camera.inverse_depth_offset * pivot)
+    if hasattr(camera, name):
+        return float(getattr(camera, name))
+    return 0.0 if when is None else float(getattr(when, name))
+
+
+def _column(name: str, features: Features, rows: np.ndarray, predicted: np.ndarray, now: Sensing, sigma: float, pivot: float) -> np.ndarray:
+    """Give by how much the measurements `rows` (O,) grow per unit of an unknown, (O, 3) [px, px, m].
+
+    predicted : (O, 3) [px, px, m] where the map says they should be. Readings themselves would not do for what stretches them: it
+    stretches their errors too, and the least errors are those of the smallest camera.
+    pivot : [m] depth of readings that the offset of inverse depth leaves as they are
+    """
+    column = np.zeros((len(rows), 3))
+    if name in TIMES:
+        moving = rolling_shutter.flow(features, now.timing.twist, now.camera, rows)
+        if name == "readout":
+            column[:, :2] = -moving.px_per_s * moving.share[:, None]
+            column[:, 2] = -moving.slant_per_s * moving.share
+        else:
+            column[:, 2] = -moving.reading_per_s * (moving.share if name == "depth_readout" else 1.0)
+        return column
+    if name in ("depth_scale", "inverse_depth_offset"):
+        z, offset = predicted[:, 2], now.camera.inverse_depth_offset
+        read = 1.0 / z - offset  # [1/m] inverse of the readings, before the offset
+        per_inverse = -z * z
+        if name == "depth_scale":
+            column[:, 2] = per_inverse * read / _number(name, now.camera, None, pivot)
+        else:
+            column[:, 2] = per_inverse * (1.0 - read * pivot / (1.0 - offset * pivot))
+        return column
+    # As the focal length changes, predictions move as well: what counts is where the ray points, in pixels of the camera of now.
+    raw, step = now.camera.distort(predicted[:, :2]), STEP * sigma
+    ahead, behind = (replace(now.camera, **{name: getattr(now.camera, name) + d}) for d in (step, -step))
+    focal = np.array([now.camera.fx, now.camera.fy])
+    column[:, :2] = (ahead.normalise(raw) - behind.normalise(raw)) * focal / (2.0 * step)
+    return column
+
+
+def estimate(
+    problem: bundle_adjustment.Problem,
+    T_cw: np.ndarray,
+    x_w: np.ndarray,
+    columns: np.ndarray,
+    *,
+    prior: np.ndarray,
+    prior_sigma: np.ndarray,
+) -> Shared | None:
+    """Find the shared numbers at an adjusted map.
+
+    columns : (O, 3, G) by how much u, v [px] and depth [m] of each observation grow per unit of each number
+    prior, prior_sigma : (G,) what is believed before looking. None where the map is not determined.
+    """
+    # Outliers stay out; among the inliers Huber's weights are close to 1 and are left out.
+    no_limits = np.array([np.inf, np.inf])
+    chi2 = problem.chi2(T_cw, x_w)
+    is_used = chi2 <= problem.threshold(np.array([bundle_adjustment.CHI2_95_2DOF, bundle_adjustment.CHI2_95_3DOF]))
+    measured = problem.measured.copy()
+    columns = columns[problem.order]
+    sqrt_w = measured[:, [3, 3, 4]] * is_used[:, None]
+    problem.measured[:, 3:] *= is_used[:, None]
+    r = residuals(problem, T_cw, x_w) * sqrt_w
+    systems = []
+    for g in range(-1, columns.shape[2]):  # -1: the map's own residuals; then each shared number in turn
+        problem.measured[:, :3] = measured[:, :3]
+        if g >= 0:
+            problem.measured[:, :3] += columns[:, :, g]
+        problem.linearize(T_cw, x_w, no_limits)
+        problem.eliminate(bundle_adjustment.DAMPING_MIN, problem.hold)
+        systems.append((problem.rhs.copy().ravel(), problem.b_l.copy()))
+    V_inv = problem.V_inv.copy()
+    factor = problem.system.factorise()
+    problem.measured[:] = measured
+    if factor is None:
+        return None
+    rhs_0, b_0 = systems[0]
+    reduced = np.array([rhs - rhs_0 for rhs, _ in systems[1:]])
+    lifted = np.array([b - b_0 for _, b in systems[1:]])
+    solved = factor.solve(np.ascontiguousarray(np.concatenate([reduced, rhs_0[None]]).T)).T
+    J = (columns * sqrt_w[:, :, None]).reshape(-1, columns.shape[2])
+    through_landmarks = np.array([[_landmark_product(a, V_inv, b) for b in (*lifted, b_0)] for a in lifted])
+    through_map = reduced @ solved.T + through_landmarks
+    A = J.T @ J - through_map[:, :-1] + np.diag(prior_sigma**-2.0)
+    # b is minus the gradient: J_map^T w r = -b_0
+    value = np.linalg.solve(A, J.T @ r.ravel() + through_map[:, -1] + prior * prior_sigma**-2.0)
+    return Shared(value=value, sigma=np.sqrt(np.diag(np.linalg.inv(A))))
+
+
+def residuals(problem: bundle_adjustment.Problem, T_cw: np.ndarray, x_w: np.ndarray) -> np.ndarray:
+    """Give prediction minus measurement (O, 3) [px, px, m] in the problem's order."""
+    lm = np.repeat(np.arange(len(x_w)), np.diff(problem.offset))
+    T = T_cw[problem.obs_kf.astype(np.int64)]
+    x_c = np.einsum("oij,oj->oi", T[:, :3, :3], x_w[lm]) + T[:, :3, 3]
+    z = np.maximum(x_c[:, 2], bundle_kernels.Z_MIN)
+    fx, fy, cx, cy = problem.camera
+    predicted = np.stack([fx * x_c[:, 0] / z + cx, fy * x_c[:, 1] / z + cy, z], axis=1)
+    return predicted - problem.measured[:, :3]
+
+
+def _landmark_product(a: np.ndarray, V_inv: np.ndarray, b: np.ndarray) -> float:
+    """Sum a^T V^-1 b over the landmarks; V_inv (L, 6) upper triangles."""
+    rows = ((0, 1, 2), (1, 3, 4), (2, 4, 5))
+    return float(sum((a[:, i] * V_inv[:, rows[i][j]] * b[:, j]).sum() for i in range(3) for j in range(3)))

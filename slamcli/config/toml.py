@@ -1,0 +1,249 @@
+"""The configuration as text: TOML files and `-s section.key=value`, merged over the defaults and checked against the declarations."""
+
+import dataclasses
+import difflib
+import math
+import sys
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, get_args, get_origin, get_type_hints
+
+from slamcli.config.options import Config
+from slamcli.errors import SlamError
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+LARGEST_FILE = 1 << 20  # bytes; ours have about ten thousand
+COMPARISONS = {
+    "ge": (">=", lambda value, bound: value >= bound),
+    "gt": (">", lambda value, bound: value > bound),
+    "le": ("<=", lambda value, bound: value <= bound),
+    "lt": ("<", lambda value, bound: value < bound),
+}
+KINDS = {bool: "true or false", int: "a whole number", float: "a number", str: 'a text in "quotes"'}
+
+
+def shipped() -> list[str]:
+    """List the configurations that come with slamcli, for `--config NAME`."""
+    return sorted(path.stem for path in _shipped_folder().glob("*.toml"))
+
+
+def _shipped_folder() -> Path:
+    """Find `configs/`: an installed package carries it inside, a checkout beside the package."""
+    package = Path(__file__).parents[1]
+    inside = package / "configs"
+    return inside if inside.is_dir() else package.parent / "configs"
+
+
+def find(name_or_file: str) -> Path:
+    """Find the file that `--config` means: a file, else one of `shipped()`."""
+    path = Path(name_or_file).expanduser()
+    if path.is_file():
+        return path
+    if name_or_file in shipped():
+        return _shipped_folder() / f"{name_or_file}.toml"
+    raise SlamError(f"--config {name_or_file}: neither a file nor one of {', '.join(shipped())}")
+
+
+def read(path: Path, base: Config | None = None) -> Config:
+    """Merge a TOML file over `base` (the defaults); SlamError names the file and the key at fault."""
+    path = Path(path)
+    try:
+        with open(path, "rb") as file:
+            text = file.read(LARGEST_FILE + 1)
+    except OSError as error:
+        raise SlamError(f"{path}: cannot be read ({error.strerror})") from error
+    if len(text) > LARGEST_FILE:
+        raise SlamError(f"{path}: too large for a configuration")
+    try:
+        values = tomllib.loads(text.decode("utf-8"))
+    except (UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError) as error:
+        raise SlamError(f"{path}: not valid TOML: {error}") from error
+    return merge(base or Config(), values, source=str(path))
+
+
+def merge(base: Config, values: Mapping[str, Any], *, source: str) -> Config:
+    """Lay nested `values` over `base`; SlamError names `source` and the key at fault."""
+    changes: dict[str, Any] = {}
+    for name, value in values.items():
+        if name == "camera" and isinstance(value, Mapping):
+            changes[name] = base.camera | {key: _camera_value(key, v, source) for key, v in value.items()}
+        elif name in _sections() and isinstance(value, Mapping):
+            section = getattr(base, name)
+            changes[name] = dataclasses.replace(section, **{key: _value(type(section), name, key, v, source) for key, v in value.items()})
+        elif name == "camera" or name in _sections():
+            raise SlamError(f"{source}: {name} is a section; write {name}.KEY=VALUE or a table [{name}]")
+        elif isinstance(value, Mapping) and value:
+            raise _unknown(f"{name}.{next(iter(value))}", source)
+        else:
+            changes[name] = _value(Config, "", name, value, source)
+    return dataclasses.replace(base, **changes)
+
+
+def apply(base: Config, assignments: Iterable[str]) -> Config:
+    """Lay the `-s section.key=value` of a command over `base`. A value is read as TOML, and as plain text where it is not TOML."""
+    for assignment in assignments:
+        key, equals, text = (part.strip() for part in assignment.partition("="))
+        if not equals or not key:
+            raise SlamError(f"-s {assignment}: write -s section.key=value, such as -s track.min_inliers=20")
+        values: Any = _parse(text)
+        for part in reversed(key.split(".", 1)):
+            values = {part: values}
+        base = merge(base, values, source=f"-s {assignment}")
+    return base
+
+
+def _parse(text: str) -> Any:
+    try:
+        parsed = tomllib.loads(f"value = {text}")
+    except (tomllib.TOMLDecodeError, RecursionError):
+        return text
+    return parsed["value"] if len(parsed) == 1 else text
+
+
+def resolve(base: Config | None, name_or_file: str | None, assignments: Iterable[str]) -> Config:
+    """Give the configuration of a command: `base` (a run's own, or the defaults) unless `--config` is given, then each `-s`."""
+    config = base or Config()
+    if name_or_file:
+        config = read(find(name_or_file))
+    return apply(config, assignments)
+
+
+def _sections() -> dict[str, Any]:
+    return {spec.name: spec.default_factory for spec in dataclasses.fields(Config) if _is_section(spec)}
+
+
+def _is_section(spec: dataclasses.Field) -> bool:
+    return spec.default_factory is not dataclasses.MISSING and dataclasses.is_dataclass(spec.default_factory)
+
+
+def _camera_keys() -> list[str]:
+    from slamcli.geometry.camera import Camera
+
+    return [spec.name for spec in dataclasses.fields(Camera)]
+
+
+def _known_keys() -> list[str]:
+    keys = [spec.name for spec in dataclasses.fields(Config) if spec.name != "camera" and not _is_section(spec)]
+    keys += [f"camera.{key}" for key in _camera_keys()]
+    return keys + [f"{name}.{spec.name}" for name, section in _sections().items() for spec in dataclasses.fields(section)]
+
+
+def _unknown(key: str, source: str) -> SlamError:
+    """Build the error for a key nobody declared, with those that may be meant: the same option of a section, else the nearest name."""
+    known = _known_keys()
+    near = [name for name in known if name.rpartition(".")[2] == key.rpartition(".")[2]]
+    if "." in key:
+        near = difflib.get_close_matches(key, near, n=1, cutoff=0.0)
+    near = near or difflib.get_close_matches(key, known, n=1, cutoff=0.6)
+    hint = f"did you mean {' or '.join(near)}?" if near else "see: slamcli config --explain"
+    return SlamError(f"{source}: {key} is not known; {hint}")
+
+
+def _camera_value(key: str, value: Any, source: str) -> float:
+    if key not in _camera_keys():
+        raise _unknown(f"camera.{key}", source)
+    expected = int if key in ("width", "height") else float
+    return _typed(expected, value, _origin(f"camera.{key}", value, source))
+
+
+def _value(section: type, section_name: str, key: str, value: Any, source: str) -> Any:
+    """Check one value against its declaration and give it in the declared type."""
+    name = f"{section_name}.{key}" if section_name else key
+    spec = next((spec for spec in dataclasses.fields(section) if spec.name == key and spec.name != "camera"), None)
+    if spec is None or _is_section(spec):
+        raise _unknown(name, source)
+    origin, meta = _origin(name, value, source), spec.metadata
+    value = _typed(get_type_hints(section)[key], value, origin)
+    for bound, limit in meta["bounds"].items():
+        sign, holds = COMPARISONS[bound]
+        if not holds(value, limit):
+            raise SlamError(f"{origin}: must be {sign} {limit} ({meta['help']})")
+    if meta["choices"] and value not in meta["choices"]:
+        raise SlamError(f"{origin}: must be one of {', '.join(map(str, meta['choices']))} ({meta['help']})")
+    if meta["is_file"] and value:
+        value = str(Path(value).expanduser().resolve())
+    return value
+
+
+def _origin(name: str, value: Any, source: str) -> str:
+    return source if source.startswith("-s ") else f"{source}: {name} = {_toml(value)}"
+
+
+def _typed(expected: Any, value: Any, origin: str) -> Any:
+    if get_origin(expected) is tuple:
+        return _typed_tuple(get_args(expected), value, origin)
+    if expected is float and isinstance(value, int) and not isinstance(value, bool):
+        value = float(value)
+    if type(value) is not expected or (expected is float and not math.isfinite(value)):
+        raise SlamError(f"{origin}: must be {KINDS[expected]}")
+    return value
+
+
+def _typed_tuple(expected: tuple, value: Any, origin: str) -> tuple:
+    if not isinstance(value, (list, tuple)):
+        raise SlamError(f"{origin}: must be a list in [brackets]")
+    if expected[-1] is Ellipsis:
+        expected = expected[:1] * len(value)
+    if len(value) != len(expected):
+        raise SlamError(f"{origin}: must be a list of {len(expected)}")
+    return tuple(_typed(kind, item, origin) for kind, item in zip(expected, value, strict=True))
+
+
+def dump(config: Config, *, explain: bool = False, only: Sequence[str] = ()) -> str:
+    """Write every value as TOML that `read` takes back.
+
+    explain : put each option's help, bounds and choices above it
+    only : sections ("track") and options ("track.min_inliers") to write; all of them when empty
+    """
+    for name in only:
+        if name not in _known_keys() and name not in _sections() and name != "camera":
+            raise _unknown(name, "config")
+    blocks = [_block("", Config, config, explain, only)]
+    blocks += [_block(name, section, getattr(config, name), explain, only) for name, section in _sections().items()]
+    if not only or any(name.partition(".")[0] == "camera" for name in only):
+        values = [f"{key} = {_toml(config.camera[key])}" for key in _camera_keys() if key in config.camera]
+        blocks.append(["[camera]  # overrides the recording's calibration; keys: " + " ".join(_camera_keys()), *values])
+    return "\n\n".join("\n".join(block) for block in blocks if block) + "\n"
+
+
+def _block(name: str, section: type, values: Any, explain: bool, only: Sequence[str]) -> list[str]:
+    """Write the options of one section that are wanted, under its heading."""
+    lines: list[str] = []
+    for spec in dataclasses.fields(section):
+        key = f"{name}.{spec.name}" if name else spec.name
+        if spec.name != "camera" and not _is_section(spec) and (not only or name in only or key in only):
+            lines += _option_lines(spec, getattr(values, spec.name), explain)
+    return [f"[{name}]  # {_first_line(section)}", *lines] if lines and name else lines
+
+
+def _option_lines(spec: dataclasses.Field, value: Any, explain: bool) -> Iterator[str]:
+    if explain:
+        meta = spec.metadata
+        limits = [f"{COMPARISONS[bound][0]} {limit}" for bound, limit in meta["bounds"].items()]
+        limits += [" | ".join(map(str, meta["choices"]))] if meta["choices"] else []
+        yield f"# {meta['help']}" + (f"; {', '.join(limits)}" if limits else "")
+    yield f"{spec.name} = {_toml(value)}"
+
+
+def _first_line(section: type) -> str:
+    return (section.__doc__ or "").strip().splitlines()[0]
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, (list, tuple)):
+        return "[" + ", ".join(map(_toml, value)) + "]"
+    if isinstance(value, str):
+        return '"' + "".join(_escaped(character) for character in value) + '"'
+    return repr(value)
+
+
+def _escaped(character: str) -> str:
+    if character in '"\\':
+        return "\\" + character
+    return character if character.isprintable() else f"\\U{ord(character):08X}"

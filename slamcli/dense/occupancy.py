@@ -1,0 +1,196 @@
+"""Occupied and free space: log-odds in a hash of 8 x 8 x 8 blocks, updated scan by scan as OctoMap does.
+
+Each scan updates a cell at most once: a cell that holds an end point is hit, any other cell that a ray passes is missed.
+
+A. Hornung et al., OctoMap, Autonomous Robots 2013, doi:10.1007/s10514-012-9321-0; the arithmetic, float32 where the C++ library has
+float, follows its `updateNodeLogOdds`, so that maps agree cell by cell.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numba import f4, i4, i8, u1, u8
+
+from slamcli.dense.ray_casting import OCCUPIED, mark_scan
+from slamcli.geometry import voxel
+from slamcli.geometry.octree import CENTRE, DEPTH, Octree
+from slamcli.geometry.voxel import find_or_add, spread
+from slamcli.jit.kernel import kernel
+
+BLOCK_CELLS = 512  # 8 x 8 x 8, within a block in Morton order
+UNTOUCHED, TOUCHED = -1, -2  # blocks of a scan's bounding box, until their row is known
+
+
+class Scan(NamedTuple):
+    """What one depth image says of the space around."""
+
+    x: np.ndarray  # (N, 3) end points [m]
+    origin: np.ndarray  # (3,) where the rays start [m]
+    frame: int = 0
+
+
+def log_odds(probability: float) -> np.float32:
+    """Give ln(p / (1 - p)); (12) of Zhao et al."""
+    return np.float32(np.log(probability / (1.0 - probability)))
+
+
+class OccupancyMap:
+    """Log-odds of cells, NaN where nothing is known."""
+
+    def __init__(self, resolution: float, *, hit: float, miss: float, clamp_min: float, clamp_max: float) -> None:
+        """Start empty.
+
+        resolution : side of a cell [m]
+        hit, miss : probability that a cell is occupied, given that a ray ends in it, or passes it
+        clamp_min, clamp_max : bounds of a cell's probability; the narrower, the sooner a moved object fades
+        """
+        self.resolution = float(resolution)
+        self._update = log_odds(miss), log_odds(hit), log_odds(clamp_min), log_odds(clamp_max)
+        columns = {"log_odds": (np.float32, np.nan), "misses": (np.uint8, 0), "last_hit": (np.int32, 0)}
+        self._blocks = voxel.VoxelRows(**{name: ((BLOCK_CELLS,), *of) for name, of in columns.items()})
+
+    @property
+    def looks(self) -> int:
+        """Give how many misses make the surest cell free."""
+        miss, _, lowest, highest = self._update
+        return int(np.ceil((highest - max(lowest, 0.0)) / -miss))
+
+    def insert(self, x_w: np.ndarray, origin: np.ndarray, *, max_range: float, discretise: bool = False, frame: int = 0) -> None:
+        """Insert one scan.
+
+        x_w : (N, 3) end points [m]; one that is not finite is skipped
+        origin : (3,) where the rays start [m]
+        max_range : farther points only free the space up to this range [m]; 0 = no limit
+        discretise : cast one ray per end cell, to its centre, instead of one per point
+        frame : number of the scan, for `doubted`
+        """
+        marked = mark_scan(x_w, origin, max_range=max_range, resolution=self.resolution, discretise=discretise)
+        if marked is None:
+            return
+        marks, lower = marked
+        rows_of_8 = marks.view(np.uint64)
+        block_row = np.full(np.array(marks.shape) >> 3, UNTOUCHED, dtype=np.int32)
+        blocks = self._blocks
+        blocks.reserve(_touch_blocks(rows_of_8, block_row))
+        blocks.n = _update_cells(
+            rows_of_8, lower, block_row, blocks.slot_row, blocks.row_key, blocks.n, *blocks.columns.values(), *self._update, frame
+        )
+
+    def doubted(self, misses: int) -> tuple[np.ndarray, np.ndarray]:
+        """Find cells that are occupied, but that the last so many scans that touched them saw free.
+
+        Returns their numbers (N, 3) x y z and the frame of the last scan that hit each (N,).
+        """
+        columns = {name: column[: self._blocks.n] for name, column in self._blocks.columns.items()}
+        block, local = np.nonzero((columns["log_odds"] > 0.0) & (columns["misses"] >= misses))
+        cell = voxel.unmorton((self._blocks.row_key[block] << 9) + local)
+        return cell, columns["last_hit"][block, local]
+
+    def centre(self, cell: np.ndarray) -> np.ndarray:
+        """Give the centres (N, 3) [m] of cells (N, 3)."""
+        return (cell - CENTRE + 0.5) * self.resolution
+
+    def leaves(self) -> Octree:
+        """Give the known cells as an octree that is not pruned."""
+        n = self._blocks.n
+        order = np.argsort(self._blocks.row_key[:n])
+        value = self._blocks.columns["log_odds"][:n][order]
+        row, local = np.nonzero(np.isfinite(value))
+        key = (self._blocks.row_key[:n][order][row] << 9) + local
+        return Octree(self.resolution, key, np.full(len(key), DEPTH, dtype=np.uint8), value[row, local])
+
+
+@dataclass(frozen=True)
+class Accuracy:
+    """How a tree agrees with scans: cells over all scans."""
+
+    correct: int
+    wrong: int
+    unknown: int  # cells of which the tree knows nothing; not counted as wrong, as in OctoMap's own evaluation
+
+    @property
+    def share(self) -> float:
+        """Give the share of known cells whose state is the scan's, NaN when none is known."""
+        return self.correct / (self.correct + self.wrong) if self.correct + self.wrong else np.nan
+
+
+def accuracy(tree: Octree, scans: Iterable[Scan], *, max_range: float, threshold: float = 0.0) -> Accuracy:
+    """Replay scans, given in the tree's frame, and count the cells whose state agrees, as OctoMap's `eval_octree_accuracy` does."""
+    is_occupied = tree.is_occupied(threshold)
+    correct = wrong = unknown = 0
+    for scan in scans:
+        marked = mark_scan(scan.x, scan.origin, max_range=max_range, resolution=tree.resolution)
+        if marked is None:
+            continue
+        marks, lower = marked
+        z, y, x = np.nonzero(marks)
+        row = tree.find(np.column_stack([x, y, z]) + lower)
+        known = row >= 0
+        agrees = is_occupied[row[known]] == (marks[z, y, x][known] == OCCUPIED)
+        correct += int(agrees.sum())
+        wrong += int((~agrees).sum())
+        unknown += int((~known).sum())
+    return Accuracy(correct, wrong, unknown)
+
+
+@kernel
+def _touch_blocks(rows_of_8: u8[:, :, ::1], block_row: i4[:, :, ::1]):
+    """Flag the blocks that hold a marked cell; returns their number."""
+    n = 0
+    for z in range(rows_of_8.shape[0]):
+        for y in range(rows_of_8.shape[1]):
+            for x in range(rows_of_8.shape[2]):
+                if rows_of_8[z, y, x] != 0 and block_row[z >> 3, y >> 3, x] == UNTOUCHED:
+                    block_row[z >> 3, y >> 3, x] = TOUCHED
+                    n += 1
+    return n
+
+
+@kernel
+def _update_cells(
+    rows_of_8: u8[:, :, ::1],
+    lower: i8[::1],
+    block_row: i4[:, :, ::1],
+    slot_row: i4[::1],
+    row_key: i8[::1],
+    n_rows: i8,
+    value: f4[:, ::1],
+    misses: u1[:, ::1],
+    last_hit: i4[:, ::1],
+    miss: f4,
+    hit: f4,
+    lowest: f4,
+    highest: f4,
+    frame: i8,
+):
+    """Update every marked cell once, (11) and (13) of Zhao et al. with clamping; returns the number of blocks."""
+    bx, by, bz = lower[0] >> 3, lower[1] >> 3, lower[2] >> 3
+    for z in range(rows_of_8.shape[0]):
+        for y in range(rows_of_8.shape[1]):
+            in_zy = spread(z & 7) << 2 | spread(y & 7) << 1
+            for x in range(rows_of_8.shape[2]):
+                marks = rows_of_8[z, y, x]
+                if marks == 0:
+                    continue
+                row = block_row[z >> 3, y >> 3, x]
+                if row == TOUCHED:
+                    row = find_or_add(slot_row, row_key, n_rows, spread(x + bx) | spread((y >> 3) + by) << 1 | spread((z >> 3) + bz) << 2)
+                    n_rows = max(n_rows, row + 1)
+                    block_row[z >> 3, y >> 3, x] = row
+                for k in range(8):
+                    mark = (marks >> np.uint64(8 * k)) & np.uint64(255)
+                    if mark == 0:
+                        continue
+                    at = in_zy | spread(k)
+                    old = value[row, at]
+                    if old != old:
+                        old = np.float32(0.0)
+                    new = old + (hit if mark == OCCUPIED else miss)
+                    value[row, at] = min(max(new, lowest), highest)
+                    if mark == OCCUPIED:
+                        misses[row, at], last_hit[row, at] = 0, frame
+                    elif misses[row, at] < 255:
+                        misses[row, at] += 1
+    return n_rows

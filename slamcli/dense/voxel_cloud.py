@@ -1,0 +1,126 @@
+"""One coloured cloud from the surfaces that key frames see: averaged in voxels, stray points dropped.
+
+A voxel holds weighted sums only, so memory grows with the surface seen and not with the number of frames.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import f4, f8, i4, i8, u1
+
+from slamcli.dense import outlier_removal
+from slamcli.depth.oriented_points import Surface
+from slamcli.geometry import se3, voxel
+from slamcli.geometry.voxel import find_or_add, spread
+from slamcli.jit.kernel import kernel
+
+HALF_EXTENT = outlier_removal.HALF_EXTENT
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """Points in Morton order of their voxels."""
+
+    xyz: np.ndarray  # (N, 3) float32 [m]
+    rgb: np.ndarray  # (N, 3) uint8
+    normal: np.ndarray  # (N, 3) float32, unit, towards the cameras that saw the point
+
+    def __len__(self) -> int:
+        return len(self.xyz)
+
+    def moved(self, T_ab: np.ndarray) -> "Cloud":
+        """Give the cloud of frame b in frame a; the order stays."""
+        xyz = se3.transform(T_ab, self.xyz.astype(np.float64)).astype(np.float32)
+        return Cloud(xyz, self.rgb, (self.normal @ T_ab[:3, :3].T).astype(np.float32))
+
+
+class VoxelCloud:
+    """A growing cloud: per voxel the weighted means of position, normal and colour."""
+
+    def __init__(self, side: float) -> None:
+        """Start empty; `side` is the voxels' [m]."""
+        self.side = float(side)
+        self._rows = voxel.VoxelRows(sums=((10,), np.float32, 0.0), count=((), np.int32, 0))
+
+    def add(self, seen: Surface, rgb: np.ndarray, T_wc: np.ndarray) -> None:
+        """Add what one key frame saw; `rgb` (H, W, 3) uint8."""
+        self._rows.reserve(len(seen.pixel))
+        rows = self._rows
+        rows.n = _add_points(
+            seen.pixel,
+            seen.xyz_c,
+            seen.normal_c,
+            seen.weight,
+            np.ascontiguousarray(rgb).reshape(-1, 3),
+            np.ascontiguousarray(T_wc, dtype=np.float64),
+            1.0 / self.side,
+            rows.slot_row,
+            rows.row_key,
+            rows.n,
+            rows.columns["sums"],
+            rows.columns["count"],
+        )
+
+    def cloud(self, *, min_points: int = 1, neighbours: int = 0, max_deviation: float = np.inf) -> Cloud:
+        """Give the voxels with at least `min_points` readings, in Morton order.
+
+        neighbours, max_deviation : points whose mean distance to so many neighbours exceeds the mean over the cloud by more than so
+            many standard deviations are dropped; 0 neighbours keep all
+        """
+        n = self._rows.n
+        row = np.flatnonzero(self._rows.columns["count"][:n] >= min_points)
+        key = self._rows.row_key[row]
+        order = np.argsort(key)
+        row, key = row[order], key[order]
+        sums = self._rows.columns["sums"][row]
+        mean = sums[:, 1:] / sums[:, :1]
+        xyz = (voxel.unmorton(key) - HALF_EXTENT + 0.5 + mean[:, :3]) * self.side
+        length = np.linalg.norm(mean[:, 3:6], axis=1, keepdims=True)
+        normal = mean[:, 3:6] / np.where(length > 0, length, 1.0)
+        rgb = np.clip(np.rint(mean[:, 6:9]), 0, 255).astype(np.uint8)
+        keep = outlier_removal.not_stray(xyz, key, side=self.side, neighbours=neighbours, max_deviation=max_deviation)
+        return Cloud(xyz[keep].astype(np.float32), rgb[keep], normal[keep])
+
+
+@kernel
+def _add_points(
+    pixel: i4[::1],
+    xyz_c: f4[:, ::1],
+    normal_c: f4[:, ::1],
+    weight: f4[::1],
+    rgb: u1[:, ::1],
+    T_wc: f8[:, ::1],
+    per_side: f8,
+    slot_row: i4[::1],
+    row_key: i8[::1],
+    n_rows: i8,
+    sums: f4[:, ::1],
+    count: i4[::1],
+):
+    """Add weighted points to their voxels; sums are weight, offset from the centre [voxels], normal, colour. Returns the rows in use."""
+    half = 1 << 20
+    for i in range(len(pixel)):
+        x, y, z = xyz_c[i, 0], xyz_c[i, 1], xyz_c[i, 2]
+        px = (T_wc[0, 0] * x + T_wc[0, 1] * y + T_wc[0, 2] * z + T_wc[0, 3]) * per_side
+        py = (T_wc[1, 0] * x + T_wc[1, 1] * y + T_wc[1, 2] * z + T_wc[1, 3]) * per_side
+        pz = (T_wc[2, 0] * x + T_wc[2, 1] * y + T_wc[2, 2] * z + T_wc[2, 3]) * per_side
+        fx, fy, fz = np.floor(px), np.floor(py), np.floor(pz)
+        if not (abs(fx) < half and abs(fy) < half and abs(fz) < half):
+            continue
+        key = spread(int(fx) + half) | spread(int(fy) + half) << 1 | spread(int(fz) + half) << 2
+        row = find_or_add(slot_row, row_key, n_rows, key)
+        n_rows = max(n_rows, row + 1)
+        w = weight[i]
+        a, b, c = normal_c[i, 0], normal_c[i, 1], normal_c[i, 2]
+        sums[row, 0] += w
+        sums[row, 1] += w * (px - fx - 0.5)
+        sums[row, 2] += w * (py - fy - 0.5)
+        sums[row, 3] += w * (pz - fz - 0.5)
+        sums[row, 4] += w * (T_wc[0, 0] * a + T_wc[0, 1] * b + T_wc[0, 2] * c)
+        sums[row, 5] += w * (T_wc[1, 0] * a + T_wc[1, 1] * b + T_wc[1, 2] * c)
+        sums[row, 6] += w * (T_wc[2, 0] * a + T_wc[2, 1] * b + T_wc[2, 2] * c)
+        sums[row, 7] += w * rgb[pixel[i], 0]
+        sums[row, 8] += w * rgb[pixel[i], 1]
+        sums[row, 9] += w * rgb[pixel[i], 2]
+        count[row] += 1
+    return n_rows

@@ -1,0 +1,176 @@
+"""Kernels of surface.py: depth images made coarse, and point-to-plane alignment by Gauss-Newton."""
+
+import numpy as np
+from numba import f4, f8, i4, i8
+
+from slamcli.geometry.cholesky import solve_damped
+from slamcli.geometry.se3 import left_update
+from slamcli.jit.kernel import kernel
+
+Z_MIN = 0.05  # [m] a point nearer to the image plane than this, or behind it, falls on nothing
+LEAST_VARIANCE_FACTOR = 0.01  # mean of w chi2: of less, images that are equal give no evidence
+BAND = 0.05  # of the nearest reading: readings farther behind it belong to another surface
+
+
+@kernel(error_model="numpy")
+def window_means(depth: f4[:, ::1], side: i8, first: i8, width: i8, out: f4[:, ::1]):
+    """Average the middle of each block of `side` px of a depth image [m]: `width` px from `first` on, both ways.
+
+    NaN where less than three quarters of them show one surface.
+    """
+    enough = 3 * width * width
+    for v in range(out.shape[0]):
+        for u in range(out.shape[1]):
+            y0, x0 = v * side + first, u * side + first
+            nearest = np.float32(np.inf)
+            for y in range(y0, y0 + width):
+                for x in range(x0, x0 + width):
+                    nearest = min(nearest, depth[y, x]) if depth[y, x] > 0.0 else nearest
+            limit, total, n = np.float32((1.0 + BAND) * nearest), np.float32(0.0), 0
+            for y in range(y0, y0 + width):
+                for x in range(x0, x0 + width):
+                    if depth[y, x] > 0.0 and depth[y, x] <= limit:
+                        total += depth[y, x]
+                        n += 1
+            out[v, u] = total / np.float32(n) if 4 * n >= enough else np.nan
+
+
+@kernel(error_model="numpy", fastmath={"contract"})
+def _normal_equations(
+    T, xyz_j, normal_j, variance_j, row_i, xyz_i, normal_i, variance_i, pinhole, step, reach, min_cosine, limit, is_final, H, b
+):  # fmt: skip
+    """Write H = sum w J^T J and b = -sum w J^T r over every `step`-th point of j; return points met, points that agree, sum of w chi2.
+
+    r = n_i (q - x_i) is the distance from the plane of i, J = (n_i, q x n_i) its derivative by the left twist of T_ij, w its inverse
+    variance times Huber's weight from chi2 = `limit` on.
+
+    Normals err, and so add to H in directions in which nothing is known: over a plane, as if it were rough. In the end, therefore,
+    H = sum w (J^T M + M^T J) / 2, with M the same of the normal of j: their errors are independent, and their products vanish on average.
+    """
+    h00 = h01 = h02 = h03 = h04 = h05 = h11 = h12 = h13 = h14 = h15 = h22 = h23 = h24 = h25 = 0.0
+    h33 = h34 = h35 = h44 = h45 = h55 = b0 = b1 = b2 = b3 = b4 = b5 = cost = 0.0
+    T00, T01, T02, T03, T10, T11, T12, T13 = T[0, 0], T[0, 1], T[0, 2], T[0, 3], T[1, 0], T[1, 1], T[1, 2], T[1, 3]
+    T20, T21, T22, T23 = T[2, 0], T[2, 1], T[2, 2], T[2, 3]
+    height, width = row_i.shape
+    met, agree = 0, 0
+    for j in range(0, len(xyz_j), step):
+        x, y, z = xyz_j[j, 0], xyz_j[j, 1], xyz_j[j, 2]
+        qz = T20 * x + T21 * y + T22 * z + T23
+        if not qz > Z_MIN:
+            continue
+        qx = T00 * x + T01 * y + T02 * z + T03
+        qy = T10 * x + T11 * y + T12 * z + T13
+        u, v = pinhole[0] * qx / qz + pinhole[2] + 0.5, pinhole[1] * qy / qz + pinhole[3] + 0.5
+        if not (u >= 0.0 and v >= 0.0 and u < width and v < height):
+            continue
+        i = row_i[int(v), int(u)]
+        if i < 0:
+            continue
+        met += 1
+        dx, dy, dz = qx - xyz_i[i, 0], qy - xyz_i[i, 1], qz - xyz_i[i, 2]
+        n0, n1, n2 = normal_i[i, 0], normal_i[i, 1], normal_i[i, 2]
+        x, y, z = normal_j[j, 0], normal_j[j, 1], normal_j[j, 2]
+        m0, m1, m2 = T00 * x + T01 * y + T02 * z, T10 * x + T11 * y + T12 * z, T20 * x + T21 * y + T22 * z
+        if not (dx * dx + dy * dy + dz * dz <= reach * reach and n0 * m0 + n1 * m1 + n2 * m2 >= min_cosine):
+            continue
+        agree += 1
+        r = n0 * dx + n1 * dy + n2 * dz
+        variance = variance_i[i] + variance_j[j]
+        chi2 = r * r / variance
+        w = 1.0 if chi2 <= limit else np.sqrt(limit / chi2)
+        cost += w * chi2
+        w /= variance
+        n3, n4, n5 = qy * n2 - qz * n1, qz * n0 - qx * n2, qx * n1 - qy * n0
+        b0 -= w * r * n0
+        b1 -= w * r * n1
+        b2 -= w * r * n2
+        b3 -= w * r * n3
+        b4 -= w * r * n4
+        b5 -= w * r * n5
+        if is_final:
+            m3, m4, m5 = qy * m2 - qz * m1, qz * m0 - qx * m2, qx * m1 - qy * m0
+        else:
+            m0, m1, m2, m3, m4, m5 = n0, n1, n2, n3, n4, n5
+        w *= 0.5
+        h00 += w * (n0 * m0 + m0 * n0)
+        h01 += w * (n0 * m1 + m0 * n1)
+        h02 += w * (n0 * m2 + m0 * n2)
+        h03 += w * (n0 * m3 + m0 * n3)
+        h04 += w * (n0 * m4 + m0 * n4)
+        h05 += w * (n0 * m5 + m0 * n5)
+        h11 += w * (n1 * m1 + m1 * n1)
+        h12 += w * (n1 * m2 + m1 * n2)
+        h13 += w * (n1 * m3 + m1 * n3)
+        h14 += w * (n1 * m4 + m1 * n4)
+        h15 += w * (n1 * m5 + m1 * n5)
+        h22 += w * (n2 * m2 + m2 * n2)
+        h23 += w * (n2 * m3 + m2 * n3)
+        h24 += w * (n2 * m4 + m2 * n4)
+        h25 += w * (n2 * m5 + m2 * n5)
+        h33 += w * (n3 * m3 + m3 * n3)
+        h34 += w * (n3 * m4 + m3 * n4)
+        h35 += w * (n3 * m5 + m3 * n5)
+        h44 += w * (n4 * m4 + m4 * n4)
+        h45 += w * (n4 * m5 + m4 * n5)
+        h55 += w * (n5 * m5 + m5 * n5)
+    b[0], b[1], b[2], b[3], b[4], b[5] = b0, b1, b2, b3, b4, b5
+    H[0, 0], H[0, 1], H[0, 2], H[0, 3], H[0, 4], H[0, 5] = h00, h01, h02, h03, h04, h05
+    H[1, 1], H[1, 2], H[1, 3], H[1, 4], H[1, 5] = h11, h12, h13, h14, h15
+    H[2, 2], H[2, 3], H[2, 4], H[2, 5] = h22, h23, h24, h25
+    H[3, 3], H[3, 4], H[3, 5], H[4, 4], H[4, 5], H[5, 5] = h33, h34, h35, h44, h45, h55
+    return met, agree, cost
+
+
+@kernel(error_model="numpy", fastmath={"contract"})
+def align(
+    T_ij: f8[:, ::1],
+    xyz_j: f4[:, ::1],
+    normal_j: f4[:, ::1],
+    variance_j: f4[::1],
+    row_i: i4[:, ::1],
+    xyz_i: f4[:, ::1],
+    normal_i: f4[:, ::1],
+    variance_i: f4[::1],
+    pinhole: f8[::1],
+    schedule: f8[:, ::1],
+    min_cosine: f8,
+    limit: f8,
+    readings_as_one: f8,
+    H_known: f8[:, ::1],
+    b_known: f8[::1],
+    H: f8[:, ::1],
+    b: f8[::1],
+):
+    """Move T_ij (4, 4), in place, to where the points of j agree best with those of i; write H (upper triangle) and b there.
+
+    A point of j meets the one of i that `row_i` (h, w) gives, -1 = none, where `pinhole` (fx, fy, cx, cy) projects it. They agree when
+    they are within reach and the cosine of their normals is at least `min_cosine`. Returns points met, points that agree, sum of w chi2.
+
+    schedule : (S, 4) rows of step, reach [m], iterations at most, length of a step of the motion that ends them
+    readings_as_one : what H and b are divided by, beside the variance factor, against H_known and b_known, known at the start besides
+    """
+    A, g, total, xi, L = np.empty((6, 6)), np.empty(6), np.zeros(6), np.empty(6), np.empty((6, 6))
+    s, done = 0, 0
+    while True:  # one call, so that what it calls is compiled into this kernel once
+        is_final = s == len(schedule)
+        step, reach = (1, schedule[s - 1, 1]) if is_final else (int(schedule[s, 0]), schedule[s, 1])
+        met, agree, cost = _normal_equations(
+            T_ij, xyz_j, normal_j, variance_j, row_i, xyz_i, normal_i, variance_i, pinhole, step, reach, min_cosine, limit, is_final, H, b
+        )  # fmt: skip
+        if is_final:
+            return met, agree, cost
+        done += 1
+        weight = step / (readings_as_one * max(cost / max(agree, 1), LEAST_VARIANCE_FACTOR))
+        for i in range(6):
+            g[i] = weight * b[i] + b_known[i]
+            for j in range(6):
+                A[i, j] = weight * H[min(i, j), max(i, j)] + H_known[i, j]
+                g[i] -= H_known[i, j] * total[j]
+        length = 0.0
+        if solve_damped(A, g, 0.0, L, xi):
+            left_update(T_ij, xi)
+            for i in range(6):
+                total[i] += xi[i]
+                length += xi[i] * xi[i]
+        if length < schedule[s, 3] ** 2 or done == schedule[s, 2]:
+            s, done = s + 1, 0

@@ -1,0 +1,199 @@
+"""Camera pose from known landmarks: P3P in RANSAC for a start, then robust refinement of the motion alone."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from slamcli.estimation import pose_kernels as kernels
+from slamcli.estimation.minimal_solvers import p3p, rigid3
+from slamcli.geometry import se3
+from slamcli.geometry.camera import Camera
+
+CHI2_95_2DOF, CHI2_95_3DOF = 5.991, 7.815  # 95 % quantiles: an observation of a pixel alone, of a pixel and its depth
+
+
+@dataclass(frozen=True)
+class PoseEstimate:
+    """A pose and the evidence for it."""
+
+    T_cw: np.ndarray  # (4, 4); ransac_rigid: T_ba
+    is_inlier: np.ndarray  # (N,) bool
+    n_inliers: int
+    information: np.ndarray  # (6, 6) inverse covariance of the left twist (rho, phi) [1/m^2, 1/rad^2]; 0 = not estimated
+    rms: float  # px, reprojection error of the inliers
+    cost: float = np.nan  # robust chi2 of the inliers
+    iterations: int = 0  # of RANSAC or of Levenberg-Marquardt
+
+
+def ransac_p3p(
+    x_w: np.ndarray,
+    xy: np.ndarray,
+    camera: Camera,
+    *,
+    rng: np.random.Generator,
+    rounds: int = 100,
+    threshold_px: float | np.ndarray = 4.0,
+    confidence: float = 0.9999,
+) -> PoseEstimate | None:
+    """Find the camera pose that most landmarks agree with.
+
+    x_w : (N, 3) [m], xy : (N, 2) [px, undistorted]; threshold_px : scalar or (N,)
+    Each round solves P3P on three pairs and lets a fourth choose among its solutions. Rounds end early once a sample free of outliers
+    has been drawn with the given confidence. None where there are fewer than four pairs or no sample had a solution.
+
+    [Z] 1.2; M. Fischler, R. Bolles, CACM 1981, doi:10.1145/358669.358692
+    """
+    n = len(x_w)
+    if n < 4:
+        return None
+    x_w, ray = _points(x_w), _rays(xy, camera)
+    sample = draw_samples(rng, n, rounds, 4)
+    solutions = p3p(x_w[sample[:, :3]], np.concatenate([ray, np.ones((n, 1))], axis=1)[sample[:, :3]])
+    T = _best_of_four(solutions, x_w[sample[:, 3]], ray[sample[:, 3]])
+    is_inlier = np.zeros(n, dtype=np.bool_)
+    best, done = kernels.rank(
+        T, T, x_w, ray, x_w, ray, False, camera.fx, camera.fy, _squared(threshold_px, n), 4, confidence, is_inlier
+    )  # fmt: skip
+    return None if best < 0 else _ransac_estimate(T[best], is_inlier, done, _rms(T[best], x_w, ray, camera, is_inlier))
+
+
+def ransac_rigid(
+    x_a: np.ndarray,
+    x_b: np.ndarray,
+    xy_a: np.ndarray,
+    xy_b: np.ndarray,
+    camera: Camera,
+    *,
+    rng: np.random.Generator,
+    rounds: int = 100,
+    threshold_px: float | np.ndarray = 4.0,
+    confidence: float = 0.9999,
+) -> PoseEstimate | None:
+    """Find the rigid motion T_ba (in the result's T_cw) between two cameras that most point pairs agree with.
+
+    x_a, x_b : (N, 3) [m], the same landmarks in the frames of camera a and b; xy_a, xy_b : (N, 2) [px, undistorted] where each camera
+    saw them. A pair is an inlier when point a falls within the threshold of xy_b and point b within the threshold of xy_a.
+    None where there are fewer than three pairs or no sample spanned a plane.
+    """
+    n = len(x_a)
+    if n < 3:
+        return None
+    x_a, x_b, ray_a, ray_b = _points(x_a), _points(x_b), _rays(xy_a, camera), _rays(xy_b, camera)
+    sample = draw_samples(rng, n, rounds, 3)
+    T_ba = rigid3(x_a[sample], x_b[sample])
+    R_ab = np.swapaxes(T_ba[:, :, :3], 1, 2)
+    T_ab = np.ascontiguousarray(np.concatenate([R_ab, -R_ab @ T_ba[:, :, 3:]], axis=2))
+    is_inlier = np.zeros(n, dtype=np.bool_)
+    best, done = kernels.rank(
+        T_ba, T_ab, x_a, ray_b, x_b, ray_a, True, camera.fx, camera.fy, _squared(threshold_px, n), 3, confidence, is_inlier
+    )  # fmt: skip
+    return None if best < 0 else _ransac_estimate(T_ba[best], is_inlier, done, _rms(T_ba[best], x_a, ray_b, camera, is_inlier))
+
+
+def refine_pose(
+    T_cw: np.ndarray,
+    x_w: np.ndarray,
+    xy: np.ndarray,
+    depth: np.ndarray,
+    sigma_px: np.ndarray,
+    sigma_z: np.ndarray,
+    camera: Camera,
+    *,
+    huber: bool = True,
+    rounds: int = 4,
+    iterations: int = 10,
+    chi2_px: float = CHI2_95_2DOF,
+    chi2_depth: float = CHI2_95_3DOF,
+) -> PoseEstimate:
+    """Refine a pose by Levenberg-Marquardt on the reprojection and depth residuals of fixed landmarks, (6)-(8).
+
+    T_cw : (4, 4) start; x_w : (N, 3) [m]; xy : (N, 2) [px, undistorted]; depth : (N,) [m], NaN = the pixel alone counts
+    sigma_px, sigma_z : (N,) [px, m] standard deviations of the measurements
+    After each round observations are sorted anew into inliers and outliers by chi2, so an early mistake can be mended; it ends when
+    nothing changes. Observations with a value that is not finite are outliers. Huber's kernel acts on an observation as a whole, from
+    the same chi2 on.
+    """
+    x_w, xy, depth = _points(x_w), _cast(xy), _cast(depth)
+    with np.errstate(divide="ignore"):
+        inv_px, inv_z = 1.0 / _cast(sigma_px), 1.0 / _cast(sigma_z)
+    with np.errstate(invalid="ignore"):  # a sum is finite when all its terms are, and five times as fast to find out
+        is_valid = np.isfinite(x_w[:, 0] + x_w[:, 1] + x_w[:, 2] + xy[:, 0] + xy[:, 1] + inv_px)
+    if not is_valid.all():
+        x_w = np.where(is_valid[:, None], x_w, np.nan)  # never in front of the camera: an outlier from the start
+    depth = np.where(np.isfinite(inv_z) & np.isfinite(depth), depth, np.nan)
+    start, is_inlier = se3.orthonormalise(T_cw), is_valid.copy()
+    T, H, cost, total = kernels.refine(
+        start, x_w, xy, depth, inv_px, inv_z, _intrinsics(camera), chi2_px, chi2_depth, huber, rounds, iterations, is_inlier
+    )
+    return PoseEstimate(
+        T_cw=T,
+        is_inlier=is_inlier,
+        n_inliers=int(is_inlier.sum()),
+        information=np.triu(H) + np.triu(H, 1).T,
+        rms=_rms(T, x_w, _rays(xy, camera), camera, is_inlier),
+        cost=cost,
+        iterations=total,
+    )
+
+
+def draw_samples(rng: np.random.Generator, n: int, rounds: int, size: int) -> np.ndarray:
+    """Draw `rounds` samples of `size` different numbers below n, (rounds, size) int64."""
+    sample = np.empty((rounds, size), dtype=np.int64)
+    for k in range(size):
+        # A number of the n - k not yet taken, moved up past each taken one at or below it, the smallest first.
+        value = rng.integers(0, n - k, size=rounds)
+        for taken in np.sort(sample[:, :k], axis=1).T:
+            value += value >= taken
+        sample[:, k] = value
+    return sample
+
+
+def _best_of_four(solutions: np.ndarray, x: np.ndarray, ray: np.ndarray) -> np.ndarray:
+    """Choose of the solutions (M, 4, 3, 4) the one that sees a fourth point x (M, 3) nearest to its ray (M, 2); NaN where there is none."""
+    x_c = np.einsum("msij,mj->msi", solutions[..., :3], x) + solutions[..., 3]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        error = ((x_c[..., :2] / x_c[..., 2:] - ray[:, None]) ** 2).sum(axis=2)
+        error = np.where(x_c[..., 2] > 0.0, error, np.inf)
+    chosen = np.argmin(np.where(np.isnan(error), np.inf, error), axis=1)
+    return np.ascontiguousarray(solutions[np.arange(len(x)), chosen])
+
+
+def _ransac_estimate(T: np.ndarray, is_inlier: np.ndarray, rounds: int, rms: float) -> PoseEstimate:
+    return PoseEstimate(
+        T_cw=se3.orthonormalise(np.vstack([T, [0.0, 0.0, 0.0, 1.0]])),
+        is_inlier=is_inlier,
+        n_inliers=int(is_inlier.sum()),
+        information=np.zeros((6, 6)),
+        rms=rms,
+        iterations=rounds,
+    )
+
+
+def _rms(T: np.ndarray, x: np.ndarray, ray: np.ndarray, camera: Camera, is_inlier: np.ndarray) -> float:
+    """Give the root mean square reprojection error [px] of the inliers, NaN without any."""
+    if not is_inlier.any():
+        return float("nan")
+    x_c = x @ T[:3, :3].T + T[:3, 3]
+    with np.errstate(divide="ignore", invalid="ignore"):  # of the others
+        u, v = camera.fx * (x_c[:, 0] / x_c[:, 2] - ray[:, 0]), camera.fy * (x_c[:, 1] / x_c[:, 2] - ray[:, 1])
+    return float(np.sqrt((u * u + v * v)[is_inlier].mean()))
+
+
+def _cast(values: np.ndarray) -> np.ndarray:
+    return np.ascontiguousarray(values, dtype=np.float64)
+
+
+def _points(x: np.ndarray) -> np.ndarray:
+    return _cast(x).reshape(-1, 3)
+
+
+def _rays(xy: np.ndarray, camera: Camera) -> np.ndarray:
+    return (_cast(xy).reshape(-1, 2) - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
+
+
+def _squared(threshold_px: float | np.ndarray, n: int) -> np.ndarray:
+    return np.ascontiguousarray(np.broadcast_to(np.square(np.asarray(threshold_px, dtype=np.float64)), (n,)))
+
+
+def _intrinsics(camera: Camera) -> np.ndarray:
+    return np.array([camera.fx, camera.fy, camera.cx, camera.cy], dtype=np.float64)

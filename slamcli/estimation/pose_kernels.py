@@ -1,0 +1,223 @@
+"""Kernels of pose.py: ranking of RANSAC's hypotheses, and Levenberg-Marquardt on the motion alone.
+
+Poses are arrays [R | t], (3, 4) or (4, 4). `ray` is the undistorted pixel on the plane z = 1. An observation's depth is NaN where the
+sensor gave none. All arrays are C-contiguous float64 unless said otherwise.
+"""
+
+import numpy as np
+from numba import b1, f8, i8
+
+from slamcli.geometry.cholesky import solve_damped
+from slamcli.geometry.se3 import left_update
+from slamcli.jit.kernel import kernel
+
+Z_MIN = 1e-2  # [m] a landmark nearer to the image plane than this, or behind it, has no projection
+CHI2_BEHIND = 1e6  # what such an observation costs: more than any that can be seen, yet finite
+DAMPING_START, DAMPING_MIN, DAMPING_MAX = 1e-4, 1e-9, 1e6
+
+
+@kernel(error_model="numpy", fastmath={"contract"})
+def _reprojection2(T, p, ray, i, fx, fy):
+    """Squared reprojection error [px^2] of point p[i] under pose T (3, 4) against ray[i]."""
+    z = T[2, 0] * p[i, 0] + T[2, 1] * p[i, 1] + T[2, 2] * p[i, 2] + T[2, 3]
+    if not z > Z_MIN:
+        return CHI2_BEHIND
+    du = fx * ((T[0, 0] * p[i, 0] + T[0, 1] * p[i, 1] + T[0, 2] * p[i, 2] + T[0, 3]) / z - ray[i, 0])
+    dv = fy * ((T[1, 0] * p[i, 0] + T[1, 1] * p[i, 1] + T[1, 2] * p[i, 2] + T[1, 3]) / z - ray[i, 1])
+    return du * du + dv * dv
+
+
+@kernel(error_model="numpy", fastmath={"contract"})
+def rank(
+    T: f8[:, :, ::1],
+    T_back: f8[:, :, ::1],
+    p: f8[:, ::1],
+    ray: f8[:, ::1],
+    p_back: f8[:, ::1],
+    ray_back: f8[:, ::1],
+    is_two_way: b1,
+    fx: f8,
+    fy: f8,
+    threshold2: f8[::1],
+    size: i8,
+    confidence: f8,
+    is_inlier: b1[::1],
+):
+    """Find the best of the hypotheses T (M, 3, 4), one per round; write its inliers; return its number, -1 = none, and the rounds done.
+
+    Point p[i] is to fall on ray[i] under T and, if is_two_way, p_back[i] on ray_back[i] under T_back. Hypotheses are ranked by the
+    truncated sum of squares (P. Torr, A. Zisserman, MLESAC, CVIU 2000, doi:10.1006/cviu.1999.0832). Rounds end once a sample of `size`
+    inliers was drawn with the given confidence.
+    """
+    n = len(p)
+    best, best_score, needed, done = -1, np.inf, len(T), 0
+    while done < needed:
+        h = done
+        done += 1
+        if T[h, 0, 0] != T[h, 0, 0]:
+            continue
+        score, count = 0.0, 0
+        for i in range(n):
+            error = _reprojection2(T[h], p, ray, i, fx, fy)
+            if is_two_way:
+                error = max(error, _reprojection2(T_back[h], p_back, ray_back, i, fx, fy))
+            if error < threshold2[i]:
+                score += error / threshold2[i]
+                count += 1
+            else:
+                score += 1.0
+            if score >= best_score:
+                break
+        if score < best_score and count > 0:
+            best, best_score = h, score
+            missed = 1.0 - (count / n) ** size
+            if missed < 1.0:
+                needed = 0 if missed <= 0.0 else min(len(T), int(np.log(1.0 - confidence) / np.log(missed)) + 1)
+    if best >= 0:
+        for i in range(n):
+            error = _reprojection2(T[best], p, ray, i, fx, fy)
+            if is_two_way:
+                error = max(error, _reprojection2(T_back[best], p_back, ray_back, i, fx, fy))
+            is_inlier[i] = error < threshold2[i]
+    return best, done
+
+
+@kernel(error_model="numpy", fastmath={"contract"})
+def normal_equations(T, x_w, xy, depth, inv_px, inv_z, is_used, camera, chi2_px, chi2_depth, robust, chi2, H, b):
+    """Accumulate H = sum w J^T J (upper triangle) and b = -sum w J^T r at pose T; write chi2 (N,); return the robust cost.
+
+    J is minus (8), as r = prediction - measurement, with the row of the depth residual below it:
+    d z / d xi = [0 0 1 Y -X 0]. w is Huber's weight of the whole observation.
+    """
+    fx, fy, cx, cy = camera[0], camera[1], camera[2], camera[3]
+    h00 = h02 = h03 = h04 = h05 = h11 = h12 = h13 = h14 = h15 = h22 = h23 = h24 = h25 = 0.0
+    h33 = h34 = h35 = h44 = h45 = h55 = b0 = b1 = b2 = b3 = b4 = b5 = cost = 0.0
+    for i in range(len(x_w)):
+        px, py, pz = x_w[i, 0], x_w[i, 1], x_w[i, 2]
+        z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
+        if not z > Z_MIN:
+            chi2[i] = CHI2_BEHIND
+            if is_used[i]:
+                cost += 2.0 * np.sqrt(chi2_px * CHI2_BEHIND) if robust else CHI2_BEHIND
+            continue
+        x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
+        y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
+        inv = 1.0 / z
+        ru, rv = (fx * x * inv + cx - xy[i, 0]) * inv_px[i], (fy * y * inv + cy - xy[i, 1]) * inv_px[i]
+        a, d = fx * inv * inv_px[i], fy * inv * inv_px[i]
+        rz, e, limit = 0.0, 0.0, chi2_px
+        if depth[i] == depth[i]:
+            rz, e, limit = (z - depth[i]) * inv_z[i], inv_z[i], chi2_depth
+        s = ru * ru + rv * rv + rz * rz
+        chi2[i] = s
+        if not is_used[i]:
+            continue
+        w = 1.0
+        if robust and s > limit:
+            w = np.sqrt(limit / s)
+            cost += 2.0 * np.sqrt(limit * s) - limit
+        else:
+            cost += s
+        c, f = -a * x * inv, -d * y * inv
+        u3, u4, u5 = y * c, z * a - x * c, -y * a
+        v3, v4, v5 = y * f - z * d, -x * f, x * d
+        z3, z4 = y * e, -x * e
+        wa, wc, wd, wf, we = w * a, w * c, w * d, w * f, w * e
+        h00 += wa * a
+        h02 += wa * c
+        h03 += wa * u3
+        h04 += wa * u4
+        h05 += wa * u5
+        h11 += wd * d
+        h12 += wd * f
+        h13 += wd * v3
+        h14 += wd * v4
+        h15 += wd * v5
+        h22 += wc * c + wf * f + we * e
+        h23 += wc * u3 + wf * v3 + we * z3
+        h24 += wc * u4 + wf * v4 + we * z4
+        h25 += wc * u5 + wf * v5
+        h33 += w * (u3 * u3 + v3 * v3 + z3 * z3)
+        h34 += w * (u3 * u4 + v3 * v4 + z3 * z4)
+        h35 += w * (u3 * u5 + v3 * v5)
+        h44 += w * (u4 * u4 + v4 * v4 + z4 * z4)
+        h45 += w * (u4 * u5 + v4 * v5)
+        h55 += w * (u5 * u5 + v5 * v5)
+        b0 -= wa * ru
+        b1 -= wd * rv
+        b2 -= wc * ru + wf * rv + we * rz
+        b3 -= w * (u3 * ru + v3 * rv + z3 * rz)
+        b4 -= w * (u4 * ru + v4 * rv + z4 * rz)
+        b5 -= w * (u5 * ru + v5 * rv)
+    H[0, 0], H[0, 1], H[0, 2], H[0, 3], H[0, 4], H[0, 5] = h00, 0.0, h02, h03, h04, h05
+    H[1, 1], H[1, 2], H[1, 3], H[1, 4], H[1, 5] = h11, h12, h13, h14, h15
+    H[2, 2], H[2, 3], H[2, 4], H[2, 5] = h22, h23, h24, h25
+    H[3, 3], H[3, 4], H[3, 5], H[4, 4], H[4, 5], H[5, 5] = h33, h34, h35, h44, h45, h55
+    b[0], b[1], b[2], b[3], b[4], b[5] = b0, b1, b2, b3, b4, b5
+    return cost
+
+
+@kernel(error_model="numpy", fastmath={"contract"})
+def refine(
+    T: f8[:, ::1],
+    x_w: f8[:, ::1],
+    xy: f8[:, ::1],
+    depth: f8[::1],
+    inv_px: f8[::1],
+    inv_z: f8[::1],
+    camera: f8[::1],
+    chi2_px: f8,
+    chi2_depth: f8,
+    robust: b1,
+    rounds: i8,
+    iterations: i8,
+    is_inlier: b1[::1],
+):
+    """Levenberg-Marquardt on T (4, 4), with the inliers (N,) found anew after each round, in place.
+
+    Returns the pose, the upper triangle of its information (6, 6), the robust cost of the inliers, the iterations done.
+    """
+    n = len(x_w)
+    trial, H, H_trial, b, b_trial = np.empty((4, 4)), np.empty((6, 6)), np.empty((6, 6)), np.empty(6), np.empty(6)
+    chi2, chi2_trial, step, L = np.empty(n), np.empty(n), np.empty(6), np.empty((6, 6))
+    total = 0
+    cost = normal_equations(T, x_w, xy, depth, inv_px, inv_z, is_inlier, camera, chi2_px, chi2_depth, robust, chi2, H, b)
+    for _ in range(rounds):
+        damping = DAMPING_START
+        for _ in range(iterations):
+            total += 1
+            if not solve_damped(H, b, damping, L, step):
+                damping *= 10.0
+                if damping > DAMPING_MAX:
+                    break
+                continue
+            expected = 0.0
+            for i in range(6):
+                expected += step[i] * (b[i] + damping * H[i, i] * step[i])
+            if expected <= 1e-9 * (1.0 + cost):
+                break
+            for i in range(4):  # trial[:, :] = T would take 6 s to compile, for the text of the error its shape check may raise
+                for j in range(4):
+                    trial[i, j] = T[i, j]
+            left_update(trial, step)
+            cost_trial = normal_equations(
+                trial, x_w, xy, depth, inv_px, inv_z, is_inlier, camera, chi2_px, chi2_depth, robust, chi2_trial, H_trial, b_trial
+            )
+            if cost_trial < cost:
+                cost = cost_trial
+                T, trial, H, H_trial, b, b_trial, chi2, chi2_trial = trial, T, H_trial, H, b_trial, b, chi2_trial, chi2
+                damping = max(DAMPING_MIN, 0.1 * damping)
+            else:
+                damping *= 10.0
+                if damping > DAMPING_MAX:
+                    break
+        changed = False
+        for i in range(n):
+            inside = chi2[i] <= (chi2_depth if depth[i] == depth[i] else chi2_px)
+            if inside != is_inlier[i]:
+                is_inlier[i] = inside
+                changed = True
+        if not changed:
+            break
+        cost = normal_equations(T, x_w, xy, depth, inv_px, inv_z, is_inlier, camera, chi2_px, chi2_depth, robust, chi2, H, b)
+    return T, H, cost, total

@@ -1,0 +1,63 @@
+"""How far the maps agree with what the camera saw and, for a simulated recording, with the scene it was made from."""
+
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import numpy as np
+
+from slamcli.datasets.tum import associate
+from slamcli.dense import occupancy
+from slamcli.errors import BadFrame
+from slamcli.evaluation import grid_truth, trajectory_error
+from slamcli.formats import octomap
+from slamcli.geometry import se3
+from slamcli.navigation import grid
+from slamcli.runs.run_directory import RunDir
+from slamcli.schema import Features, Grid, Ground, Map, Tracks, frame_poses
+from slamcli.stages.densify import depth_poses
+from slamcli.stages.octree import scans
+
+Progress = Callable[..., Iterable]
+
+
+def octree_accuracy(run: RunDir, *, progress: Progress) -> dict[str, Any]:
+    """Replay the key frames' depth against the octree: the share of cells whose state is what the scan says.
+
+    A. Hornung et al., OctoMap, Autonomous Robots 2013, section 5.2, doi:10.1007/s10514-012-9321-0
+    """
+    tree, config = octomap.read(run.stage_path("octree", "map.ot")), run.config()
+    T_lw = run.load(Ground, "densify").T_lw
+    poses = [(frame, T_lw @ T_wk) for frame, T_wk in depth_poses(run, frames="key")]
+    replay = scans(run.dataset(), run.camera("loop"), progress(poses, "eval map"), config.sensor, config.octree, workers=config.run.workers)
+    found = occupancy.accuracy(tree, replay, max_range=config.octree.max_range)
+    share = float(found.share) if np.isfinite(found.share) else None
+    return {"accuracy": share, "correct": found.correct, "wrong": found.wrong, "unknown": found.unknown, "scans": len(poses)}
+
+
+def has_scene(run: RunDir) -> bool:
+    """Say whether a run's recording is a simulated one that brings its scene along."""
+    return (run.dataset().root / "scene.json").is_file()
+
+
+def grid_score(run: RunDir, *, progress: Progress) -> dict[str, Any]:
+    """Compare the grid with the scene: shares of cells right, and whether the special boxes are in it."""
+    dataset, camera, settings = run.dataset(), run.camera(), run.config().grid2d
+    scene, cells = grid_truth.read_scene(dataset.root / "scene.json"), run.load(Grid, "grid2d")
+    features, T_lw, truth = run.load(Features, "extract"), run.load(Ground, "densify").T_lw, trajectory_error.ground_truth(run)
+    aligned = trajectory_error.ape(trajectory_error.stage_trajectory(run, "loop"), truth, n_frames=len(features.stamp), name=str(run.path))
+    T_sl = aligned.T_gw @ se3.inverse(T_lw)  # a simulated recording's truth is given in its scene's frame
+    T_lc = T_lw @ frame_poses(run.load(Tracks, "loop"), run.load(Map, "loop"))
+    frames = grid.spaced(T_lc, metres=settings.spacing, degrees=settings.spacing_deg)
+    frames = frames[np.isfinite(features.depth_stamp[frames])]
+
+    def points() -> Iterable[np.ndarray]:
+        """Give what each frame that the grid is made from truly showed."""
+        for row, true_row in progress(associate(features.depth_stamp[frames], truth.stamp), "eval map"):
+            try:
+                depth = dataset.depth(int(frames[row]))
+            except BadFrame:
+                continue
+            if depth is not None:
+                yield grid_truth.exact_points(scene, depth, truth.T_wc[true_row], camera, max_range=settings.max_range)
+
+    return grid_truth.score(cells, scene, T_sl, points(), band=(settings.band_low, settings.band_high)).to_dict()

@@ -1,0 +1,125 @@
+"""Everything the page says, gathered from the run directory."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from slamcli import schema
+from slamcli.errors import SlamError
+from slamcli.evaluation import trajectory_error
+from slamcli.evaluation.trajectory_error import Ape
+from slamcli.geometry import se3
+from slamcli.runs.run_directory import RunDir
+from slamcli.runs.staleness import State
+from slamcli.schema import Closures, Features, Ground, Map, Tracks, Trajectory
+
+UPRIGHT = np.array(
+    [[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+)  # world to level, no floor known
+
+
+@dataclass(frozen=True)
+class Content:
+    """A run as the page shows it. `F` frames; poses in the level frame, z up."""
+
+    name: str
+    stage: str  # whose trajectory is shown
+    stamp: np.ndarray  # (F,) [s]
+    T_lc: np.ndarray  # (F, 4, 4), NaN = lost
+    state: np.ndarray  # (F,) as in Tracks
+    n_inliers: np.ndarray  # (F,)
+    n_features: np.ndarray  # (F,)
+    loops: np.ndarray  # (C, 2) frames
+    ground: Ground | None
+    ape: dict[str, Ape]  # by stage; empty without ground truth
+    no_truth: str  # why there is none, or ""
+    x_truth: np.ndarray  # (N, 3) level frame
+    states: dict[str, State]
+    recording: dict[str, Any]
+    doubts: list[str] = field(default_factory=list)  # of the recording's reader
+
+    @property
+    def has_pose(self) -> np.ndarray:
+        """Say which frames have a pose."""
+        return np.isfinite(self.T_lc[:, 0, 0])
+
+    def summary(self, stage: str) -> dict[str, Any]:
+        """Give what a stage said of itself; nothing where it was not run."""
+        return self.states[stage].record.get("summary", {})
+
+
+def collect(run: RunDir) -> Content:
+    """Gather a run; it may have ended after any stage from track on."""
+    stage = trajectory_error.last_stage(run)
+    features, map_, tracks = run.load(Features, "extract"), run.load(Map, stage), run.load(Tracks, stage)
+    ground = run.load(Ground, "densify") if run.record("densify") is not None else None
+    T_lw = ground.T_lw if ground is not None else UPRIGHT
+    T_lc = T_lw @ schema.frame_poses(tracks, map_)
+    truth, no_truth = _truth(run)
+    ape = _ape(run, features.stamp, truth)
+    recording, doubts = _recording(run)
+    return Content(
+        name=str(run.info()["dataset"]),
+        stage=stage,
+        stamp=np.array(features.stamp),
+        T_lc=T_lc,
+        state=np.array(tracks.state),
+        n_inliers=np.array(tracks.n_inliers),
+        n_features=np.diff(features.offset),
+        loops=_loops(run, stage, map_),
+        ground=ground,
+        ape=ape,
+        no_truth=no_truth,
+        x_truth=_truth_in_level(truth, ape.get(stage), T_lw),
+        states=run.states(),
+        recording=recording,
+        doubts=doubts,
+    )
+
+
+def _truth(run: RunDir) -> tuple[Trajectory | None, str]:
+    try:
+        truth = run.dataset().ground_truth()
+    except SlamError as error:
+        return None, str(error)
+    return truth, "" if truth is not None else "The recording has no ground truth, so errors cannot be given."
+
+
+def _ape(run: RunDir, stamp: np.ndarray, truth: Trajectory | None) -> dict[str, Ape]:
+    found: dict[str, Ape] = {}
+    if truth is None:
+        return found
+    for stage in trajectory_error.STAGES:
+        if run.record(stage) is not None:
+            try:
+                found[stage] = trajectory_error.ape(
+                    trajectory_error.stage_trajectory(run, stage), truth, n_frames=len(stamp), name=stage, stage=stage
+                )
+            except SlamError:  # too few poses to align: the page says how many there are
+                continue
+    return found
+
+
+def _truth_in_level(truth: Trajectory | None, ape: Ape | None, T_lw: np.ndarray) -> np.ndarray:
+    """Move the true path to where the estimate lies, for the time that the estimate covers."""
+    if truth is None or ape is None:
+        return np.empty((0, 3))
+    during = (truth.stamp >= ape.stamp[0]) & (truth.stamp <= ape.stamp[-1])
+    return se3.transform(T_lw @ se3.inverse(ape.T_gw), truth.T_wc[during, :3, 3])
+
+
+def _loops(run: RunDir, stage: str, map_: Map) -> np.ndarray:
+    if stage != "loop":
+        return np.empty((0, 2), dtype=np.int32)
+    kf = run.load(Closures, "loop").closure_kf
+    return map_.kf_frame[kf[(map_.kf_segment[kf] == 0).all(axis=1)]]
+
+
+def _recording(run: RunDir) -> tuple[dict[str, Any], list[str]]:
+    """Describe the recording and say what its reader doubts; the recording itself may be gone by now."""
+    about = {"root": run.info()["root"], "camera": run.camera().to_dict()}
+    try:
+        return about, list(run.dataset().warnings)
+    except SlamError as error:
+        return about, [str(error)]

@@ -1,0 +1,98 @@
+"""Find the camera of a new recording in the map of an old run."""
+
+import tempfile
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from slamcli.calibration import rolling_shutter, self_calibration
+from slamcli.calibration.self_calibration import Sensing
+from slamcli.config.options import Config
+from slamcli.datasets import Dataset
+from slamcli.errors import SlamError
+from slamcli.runs.pipeline import Pipeline
+from slamcli.runs.run_directory import RunDir
+from slamcli.schema import LOST, CoarseDepth, Features, Map, Matches, Timing, Tracks, Trajectory, Words, trajectory
+from slamcli.slam import final_refinement
+from slamcli.slam.depth_tracking import Reliefs
+from slamcli.slam.localizer import Localiser
+from slamcli.sparse_map.sparse_map import MapBuilder
+
+LOOKS = 2  # at all frames with hindsight: the motion that rectifies them comes from the look before
+
+Progress = Callable[..., Iterable]
+
+
+@dataclass(frozen=True)
+class Localised:
+    """Where the camera of a recording was in the world of a run."""
+
+    trajectory: Trajectory  # of the frames that were found
+    n_frames: int
+
+    @property
+    def coverage(self) -> float:
+        """Give the share of the frames that were found."""
+        return len(self.trajectory.stamp) / self.n_frames
+
+    def to_dict(self) -> dict[str, Any]:
+        """Give the figures as plain values."""
+        return {"n_frames": self.n_frames, "n_poses": len(self.trajectory.stamp), "coverage": self.coverage}
+
+
+def localise(run: RunDir, recording: Dataset, *, progress: Progress) -> Localised:
+    """Find every frame of `recording` in the map that loop left in `run`; the map stays as it is.
+
+    The recording goes through extract and match under the run's own configuration, in a folder that is removed again.
+    Raises SlamError where the run has no map or where no frame was recognised.
+    """
+    config = run.config()
+    run.stage_path("loop")
+    with tempfile.TemporaryDirectory(prefix="slamcli-localize-") as folder:
+        new = RunDir.create(Path(folder) / "run", dataset=recording.name, root=str(recording.root.resolve()), digest=recording.digest())
+        new.write_config(config)
+        Pipeline(new, config, dataset=recording).bring_up_to_date(until="match")
+        return _find(run, new, config, progress)
+
+
+def _find(run: RunDir, new: RunDir, config: Config, progress: Progress) -> Localised:
+    map_, when = run.load(Map, "loop"), run.load(Timing, "loop")
+    given, camera = run.camera(), run.camera("loop")
+    builder = MapBuilder.from_map(self_calibration.correct(run.load(Features, "extract"), given, Sensing(camera, when, {})), map_)
+    features = new.load(Features, "extract")
+    if new.camera() == given:  # the same camera: what the run found of it holds here too
+        features = self_calibration.recalibrate(features, given, camera)
+    else:
+        camera = new.camera()
+    localiser = Localiser(
+        builder,
+        run.load(Words, "match"),
+        features,
+        new.load(Words, "match"),
+        new.load(Matches, "match"),
+        camera,
+        config.track,
+        config.sensor,
+        np.random.default_rng(config.seed),
+        reliefs=Reliefs(new.load(CoarseDepth, "extract"), new.camera(), config.sensor).under(camera),
+        map_reliefs=Reliefs(run.load(CoarseDepth, "extract"), given, config.sensor).under(run.camera("loop")),
+    )
+    for i in progress(range(len(features.stamp)), "localize"):
+        localiser.process(i)
+    tracks = localiser.tracks()
+    if (tracks.state == LOST).all():
+        raise SlamError(f"{new.info()['root']}: no frame was recognised in the map of {run.path}; do both show the same place?")
+    tracks = _refine(builder, features, tracks, when, map_, camera, config, progress)
+    return Localised(trajectory(np.array(features.stamp), tracks, map_), len(features.stamp))
+
+
+def _refine(builder, features, tracks: Tracks, when: Timing, map_: Map, camera, config: Config, progress: Progress) -> Tracks:
+    """Look at all frames again, their features rectified by the timing that the run found for its camera."""
+    for _ in range(LOOKS):
+        moving = replace(when, twist=rolling_shutter.frame_twists(features.stamp, tracks, map_))
+        rectified = rolling_shutter.rectify(features, moving, camera)
+        tracks = final_refinement.refine_frames(builder, rectified, tracks, camera, config.sensor, config.track, progress)
+    return tracks

@@ -1,0 +1,272 @@
+"""Run stages: give each what it declared and nothing else, record what it did, and run exactly those that are not up to date."""
+
+import importlib
+import logging
+import math
+import platform
+import zlib
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from slamcli import __version__, console, files
+from slamcli.config.options import Config
+from slamcli.errors import SlamError
+from slamcli.jit import compilation
+from slamcli.parallel import one_thread_in_blas
+from slamcli.runs import run_directory, staleness
+from slamcli.runs.cost_meter import Meter
+from slamcli.runs.run_directory import RunDir
+from slamcli.runs.staleness import State
+from slamcli.schema import FORMAT
+from slamcli.stages import NAMES, STAGES, Stage, stage_named
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from slamcli.datasets import Dataset
+    from slamcli.geometry.camera import Camera
+
+__all__ = ["NAMES", "STAGES", "Inputs", "Pipeline", "Settings", "Stage", "Tools"]
+
+Item = TypeVar("Item")
+Record = TypeVar("Record")
+log = logging.getLogger(__name__)
+
+MOST_WARNINGS = 100  # kept in a record and shown; the rest are counted
+PACKAGES = {"numpy": "numpy", "numba": "numba", "opencv": "opencv-python-headless", "open3d": "open3d", "scipy": "scipy"}
+
+
+class Settings:
+    """The configuration as one stage may see it: its declared sections and the seed. Anything else would escape the staleness key."""
+
+    def __init__(self, stage: Stage, config: Config) -> None:
+        self.seed = config.seed
+        for name in stage.config:
+            setattr(self, name, getattr(config, name))
+
+    def __getattr__(self, name: str) -> Any:
+        raise AttributeError(f"the stage does not declare the section {name!r} in its row of STAGES")
+
+
+class Inputs:
+    """What a stage may read: the stages it declares, and the recording."""
+
+    def __init__(self, stage: Stage, run: RunDir, dataset: Callable[[], "Dataset"]) -> None:
+        self._stage, self._run, self._dataset = stage, run, dataset
+
+    def _declared(self, name: str) -> str:
+        if name not in self._stage.needs:
+            raise AttributeError(f"{self._stage.name} does not declare that it needs {name}")
+        return name
+
+    @property
+    def dataset(self) -> "Dataset":
+        """Give the recording."""
+        self._declared("dataset")
+        return self._dataset()
+
+    def load(self, cls: type[Record], stage: str) -> Record:
+        """Read a record of arrays that `stage` wrote."""
+        from slamcli import artifacts
+
+        return artifacts.load(cls, self._run.path / self._declared(stage))
+
+    def camera(self, stage: str = "extract") -> "Camera":
+        """Give the intrinsics that extract used, or those known after optimize or loop."""
+        return self._run.camera(self._declared(stage))
+
+    def path(self, stage: str, *names: str) -> Path:
+        """Name a file that `stage` wrote."""
+        return self._run.path.joinpath(self._declared(stage), *names)
+
+
+class Tools:
+    """What a stage may use beside its inputs: threads, progress, warnings, random numbers."""
+
+    def __init__(self, stage: str, config: Config) -> None:
+        self.workers = config.run.workers
+        self.warnings: list[str] = []
+        self.n_warnings = 0
+        self._stage, self._seed = stage, config.seed
+
+    def progress(self, iterable: Iterable[Item], label: str, total: int | None = None) -> Iterator[Item]:
+        """Pass items through under a progress bar."""
+        return console.progress(iterable, label, total)
+
+    def warn(self, message: str) -> None:
+        """Tell the user of something that was worked round; the record keeps it."""
+        self.n_warnings += 1
+        if self.n_warnings <= MOST_WARNINGS:
+            self.warnings.append(message)
+            log.warning("%s: %s", self._stage, message)
+        else:
+            log.debug("%s: %s", self._stage, message)
+
+    def rng(self) -> "np.random.Generator":
+        """Give the stage's own random numbers: the same for the same seed, whatever ran before."""
+        import numpy as np
+
+        return np.random.default_rng([self._seed, zlib.crc32(self._stage.encode())])
+
+
+class Pipeline:
+    """The stages of one run under one configuration."""
+
+    def __init__(self, run: RunDir, config: Config, *, dataset: "Dataset | None" = None) -> None:
+        self.run, self.config = run, config
+        self.recording_note = ""  # why the recording could not be looked at, where it could not
+        self._opened = dataset
+        self._dataset_digest: str | None = None
+
+    # what holds
+
+    def dataset(self) -> "Dataset":
+        """Open the recording once."""
+        if self._opened is None:
+            self._opened = self.run.dataset(self.config)
+        return self._opened
+
+    def states(self, *, verify: bool = False) -> dict[str, State]:
+        """Judge every stage, looking at the recording and at the files that options name as they are now."""
+        return self.run.states(self.config, verify=verify, input_digest=self._input_digest)
+
+    def _input_digest(self, name: str) -> str | None:
+        """Digest the recording or a file an option names; None where it is not there, so that what was made from it still stands."""
+        if name != "dataset":
+            section, _, option = name.partition(".")
+            path = Path(getattr(getattr(self.config, section), option))
+            return f"sha256:{files.sha256(path)}" if path.is_file() else None
+        try:
+            self._dataset_digest = self._dataset_digest or self.dataset().digest()
+        except SlamError as error:
+            self.recording_note = f"{error}; what was made from the recording is believed to be of it"
+        return self._dataset_digest
+
+    def notes(self, states: Mapping[str, State]) -> list[str]:
+        """Say what is worth knowing beside the states: a recording that is gone, results made with other versions."""
+        found = [self.recording_note] if self.recording_note else []
+        here = environment()
+        for name, value in here.items():
+            stages: dict[str, list[str]] = {}
+            for state in states.values():
+                then = state.record.get("environment", {}).get(name, value)
+                if then != value and name != "slamcli":
+                    stages.setdefault(then, []).append(state.stage)
+            found += [f"{', '.join(made)} made with {name} {then}, here is {value}" for then, made in stages.items()]
+        return found
+
+    # making it hold
+
+    def bring_up_to_date(self, *, start: str | None = None, until: str | None = None, force: bool = False) -> None:
+        """Run what is not up to date, in order; `start` (or, with `force`, the first) to `until` in any case."""
+        last = NAMES.index(until) if until else len(NAMES) - 1
+        first_forced = NAMES.index(start) if start else 0 if force else len(NAMES)
+        if start and last < first_forced:
+            raise SlamError(f"--from {start} --until {until}: {until} comes before {start}")
+        for index, stage in enumerate(STAGES[: last + 1]):
+            state = self.states()[stage.name]
+            if state.is_fresh and index < first_forced:
+                console.say(f"{stage.name:<9}  {state.state}")
+                continue
+            log.info("%s: %s", stage.name, state.reason or state.state if index < first_forced else "asked for")
+            self.run_stage(stage)
+        if self.recording_note:
+            log.warning("%s", self.recording_note)
+
+    def run_alone(self, name: str) -> None:
+        """Run one stage, even when it is up to date, from whatever its predecessors left."""
+        stage, states = stage_named(name), self.states()
+        for need in (states[n] for n in stage.needs if n != "dataset"):
+            if need.state == staleness.MISSING:
+                raise SlamError(f"{name} needs {need.stage}, which has not been run; try: slamcli run --until {need.stage}")
+            if need.state == staleness.DAMAGED:
+                raise SlamError(f"{name} needs {need.stage}, which is damaged ({need.reason}); try: slamcli run --until {need.stage}")
+            if not need.is_fresh:
+                log.warning("%s rests on %s, which is stale (%s); slamcli run would bring it up to date", name, need.stage, need.reason)
+        self.run_stage(stage)
+
+    def run_stage(self, stage: Stage) -> None:
+        """Run one stage and put its folder in place; whatever goes wrong, the result before stays."""
+        inputs = {name: self._present_input(name) for name in (*stage.needs, *staleness.named_files(stage, self.config))}
+        tools = Tools(stage.name, self.config)
+        if stage is STAGES[0]:  # the record of the first stage is where the recording's own faults belong
+            for warning in self.dataset().warnings:
+                tools.warn(warning)
+        compilation.ensure()
+        with self.run.writing(stage.name) as out:
+            try:
+                with Meter() as meter, one_thread_in_blas():
+                    module = importlib.import_module(f"slamcli.stages.{stage.name}")
+                    meter.watch_compiler()
+                    summary = module.run(Inputs(stage, self.run, self.dataset), out, Settings(stage, self.config), tools)
+            except KeyboardInterrupt:
+                raise KeyboardInterrupt(f"interrupted in {stage.name}; earlier stages are kept") from None
+            record = self._record(stage, inputs, run_directory.outputs(out), meter, tools, summary)
+            self.run.commit(stage.name, out, record)
+        log.debug("%s", record)
+        console.say(console.stage_line(record))
+
+    def _present_input(self, name: str) -> str:
+        if name in NAMES:
+            return str((self.run.record(name) or {})["digest"])
+        if name == "dataset":
+            return self.dataset().digest()
+        digest = self._input_digest(name)
+        if digest is None:
+            section, _, option = name.partition(".")
+            raise SlamError(f"{name}: {getattr(getattr(self.config, section), option)} is not there")
+        return digest
+
+    def _record(
+        self,
+        stage: Stage,
+        inputs: Mapping[str, str],
+        outputs: Mapping[str, Mapping[str, Any]],
+        meter: Meter,
+        tools: Tools,
+        summary: Mapping[str, Any],
+    ) -> dict[str, Any]:
+        declared = staleness.declared(stage, self.config)
+        frames = summary.get("frames")
+        return {
+            "format": FORMAT,
+            "stage": stage.name,
+            "key": staleness.key(declared, inputs),
+            "config": declared,
+            "inputs": dict(inputs),
+            "outputs": outputs,
+            "digest": staleness.digest({name: entry["sha256"] for name, entry in outputs.items()}),
+            "environment": environment(),
+            "seconds": round(meter.seconds, 3),
+            "cpu_seconds": round(meter.cpu_seconds, 3),
+            "compile_seconds": round(meter.compile_seconds, 3),
+            "fps": round(frames / meter.seconds, 2) if frames and meter.seconds > 0 else None,
+            "peak_rss_mb": round(meter.peak_rss_mb, 1),
+            "summary": _plain(summary),
+            "warnings": tools.warnings,
+            "n_warnings": tools.n_warnings,
+        }
+
+
+def _plain(value: Any) -> Any:
+    """Turn numpy scalars and arrays within a summary into JSON values; what is not finite becomes null."""
+    if isinstance(value, Mapping):
+        return {str(name): _plain(item) for name, item in value.items()}
+    if hasattr(value, "tolist"):
+        value = value.tolist()
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def environment() -> dict[str, str]:
+    """Name the versions a result may depend on; they are recorded and shown, and make nothing stale."""
+    found = {"slamcli": __version__, "python": platform.python_version()}
+    for name, package in PACKAGES.items():
+        try:
+            found[name] = version(package)
+        except PackageNotFoundError:  # another build of the same library, such as opencv-python
+            found[name] = "unknown"
+    return found

@@ -1,0 +1,194 @@
+"""Frames and key frames placed by the shape that their depth images show, where texture ends."""
+
+from collections import OrderedDict
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from slamcli.config.options import SensorConfig
+from slamcli.depth import icp
+from slamcli.depth.icp import Alignment, Relief
+from slamcli.geometry import se3
+from slamcli.geometry.camera import Camera
+from slamcli.schema import CoarseDepth
+from slamcli.sparse_map.sparse_map import MapBuilder
+
+LEAST_POINTS = 0.05  # share of the coarse pixels that must show a surface
+KEPT = 48  # reliefs, of half a megabyte each
+MIN_AGREEMENT = 0.6  # of the points that meet: less, and it is another place, or the start was too far off
+MIN_OVERLAP = 0.15  # of the points of a key frame, that a frame must still show
+FIT_CHI2 = 50.0  # three times the 99 % quantile of six directions: shape's information is a guess
+JOIN_OVERLAP = 0.25  # that two key frames need for an edge
+JOIN_M, JOIN_COSINE = 1.2, 0.6  # key frames farther apart, or turned by more, are not looked at
+JOIN_MOST = 5  # edges of a new key frame to earlier ones: more of them hold down the drift of a chain
+
+
+class Reliefs:
+    """The reliefs of a recording's frames; those used last are kept."""
+
+    def __init__(self, depth: CoarseDepth, given: Camera, sensor: SensorConfig, *, camera: Camera | None = None) -> None:
+        """Take the coarse depth images, read under the calibration `given`; camera : what is known of the camera, if more."""
+        self._depth, self._given, self._camera, self._sensor = depth, given, camera or given, sensor
+        self._kept: OrderedDict[int, Relief | None] = OrderedDict()
+
+    def under(self, camera: Camera) -> "Reliefs":
+        """Give the reliefs as they are under another calibration of the same camera."""
+        return self if camera == self._camera else Reliefs(self._depth, self._given, self._sensor, camera=camera)
+
+    def of(self, frame: int) -> Relief | None:
+        """Give the relief of a frame, None where it shows too little."""
+        if frame in self._kept:
+            self._kept.move_to_end(frame)
+            return self._kept[frame]
+        self._kept[frame] = found = self._make(frame)
+        if len(self._kept) > KEPT:
+            self._kept.popitem(last=False)
+        return found
+
+    def _make(self, frame: int) -> Relief | None:
+        images = self._depth.coarse_depth
+        if not 0 <= frame < len(images) or not images[frame].any():
+            return None
+        relief = icp.relief(images[frame], self._camera, self._sensor, given=self._given)
+        return relief if len(relief) >= LEAST_POINTS * relief.row.size else None
+
+
+class NoReliefs(Reliefs):
+    """Of a recording whose depth images are not looked at."""
+
+    def __init__(self) -> None:
+        """Take nothing."""
+
+    def of(self, frame: int) -> None:
+        """Give no relief."""
+
+    def under(self, camera: Camera) -> "NoReliefs":
+        """Give these."""
+        return self
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Where a frame stands by shape, and the evidence."""
+
+    T_cw: np.ndarray  # (4, 4)
+    kf: int  # key frame that it was aligned with
+    alignment: Alignment
+    n_determined: int  # of the 6 directions of motion, by shape and by what was known besides
+
+    @property
+    def is_sound(self) -> bool:
+        """Say whether the two depth images show the same place."""
+        return self.alignment.agreement >= MIN_AGREEMENT and self.alignment.overlap >= MIN_OVERLAP
+
+    def fits(self, T_cw: np.ndarray) -> bool:
+        """Say whether another pose of the frame contradicts nothing that shape says."""
+        e = se3.log(T_cw @ se3.inverse(self.T_cw))
+        return bool(e @ self.alignment.information @ e < FIT_CHI2)
+
+
+class Shape:
+    """Places frames by aligning their depth images with those of key frames."""
+
+    def __init__(self, builder: MapBuilder, map_reliefs: Reliefs, reliefs: Reliefs) -> None:
+        """Take the map with the reliefs of the recording it is of, and those of the recording whose frames are placed."""
+        self._builder, self._map_reliefs, self._reliefs = builder, map_reliefs, reliefs
+
+    def place(self, frame: int, kf: int, starts: list[np.ndarray], known: tuple[np.ndarray, np.ndarray] | None = None) -> Placement | None:
+        """Align a frame with key frame `kf` from the first of the poses `starts` (T_cw) that leads to a sound placement.
+
+        known : a pose T_cw (4, 4) and the information (6, 6) of its left twist, as landmarks give. None where depth is missing.
+        """
+        target, source = self._reliefs.of(frame), self._map_reliefs.of(int(self._builder.kf.frame[kf]))
+        if target is None or source is None:
+            return None
+        T_wk = self._builder.kf.T_wk[kf]
+        besides = None if known is None else (known[0] @ T_wk, known[1])
+        placement = None
+        for T_cw in starts:
+            found = icp.align(T_cw @ T_wk, source, target, known=besides)
+            information = found.information + (0.0 if known is None else known[1])
+            candidate = Placement(found.T_ij @ se3.inverse(T_wk), kf, found, icp.n_determined(information, found.depth))
+            if placement is None or candidate.alignment.agreement > placement.alignment.agreement:
+                placement = candidate
+            if placement.is_sound:
+                break
+        return placement
+
+    def find(
+        self, frame: int, kfs: Iterable[int], starts: list[np.ndarray], landmarks: Callable[[Placement], tuple | None]
+    ) -> Placement | None:
+        """Align a frame with one key frame after the other, until one determines its pose; else give the best placement.
+
+        landmarks : gives, first, the pose estimate of the landmarks found around a placement, None where there are too few
+        """
+        if self._reliefs.of(frame) is None:
+            return None
+        best = None
+        for kf in kfs:
+            placed = self.place(frame, kf, starts)
+            if placed is not None and placed.is_sound and placed.n_determined < 6:
+                few = landmarks(placed)
+                if few is not None:
+                    placed = self.place(frame, kf, [placed.T_cw], (few[0].T_cw, few[0].information))
+            if placed is not None and placed.is_sound and (best is None or placed.n_determined > best.n_determined):
+                best = placed
+            if best is not None and best.n_determined == 6:
+                break
+        return best
+
+    def fixes_all(self, frame: int) -> bool:
+        """Say whether the shape that a frame shows determines all directions of motion, so that a map can begin with it."""
+        # Not by itself: the errors of its normals would agree, and a wall would seem rough.
+        here, there = self._reliefs.of(frame), self._reliefs.of(frame + 1) or self._reliefs.of(frame - 1)
+        if here is None or there is None:
+            return False
+        found = icp.align(np.eye(4), here, there)
+        return found.agreement >= MIN_AGREEMENT and icp.n_determined(found.information, found.depth) == 6
+
+    def join(self, kf: int) -> int:
+        """Add edges between a key frame and the earlier ones around that show the same; returns how many."""
+        n = 0
+        table = self._builder.kf
+        around = self.around(table.T_wk[kf], int(table.segment[kf]))
+        for other in around[around < kf]:
+            n += self.join_pair(kf, int(other))
+            if n == JOIN_MOST:
+                break
+        return n
+
+    def join_covisible(self, T_cd: np.ndarray, *, most: int, least: int) -> int:
+        """Add edges between each key frame and up to `most` earlier ones that share at least `least` landmarks; returns how many.
+
+        T_cd : (K, 4, 4) each key frame's camera when its depth was measured, to its camera when colour was
+        """
+        n = 0
+        joined = set(map(tuple, self._builder.edge.kf.tolist()))
+        for kf in range(1, len(self._builder.kf)):
+            neighbours, shared = self._builder.covisible(kf)
+            for other in neighbours[(neighbours < kf) & (shared >= least)][:most].tolist():
+                n += (kf, other) not in joined and self.join_pair(kf, other, T_cd)
+        return n
+
+    def join_pair(self, kf_i: int, kf_j: int, T_cd: np.ndarray | None = None) -> bool:
+        """Add an edge between two key frames if their depth images show the same and determine how the two lie."""
+        table = self._builder.kf
+        T_i, T_j = (np.eye(4) if T_cd is None else T_cd[kf] for kf in (kf_i, kf_j))
+        target, source = (self._map_reliefs.of(int(table.frame[kf])) for kf in (kf_i, kf_j))
+        if target is None or source is None:
+            return False
+        found = icp.align(se3.inverse(table.T_wk[kf_i] @ T_i) @ table.T_wk[kf_j] @ T_j, source, target)
+        if found.agreement < MIN_AGREEMENT or found.overlap < JOIN_OVERLAP or icp.n_determined(found.information, found.depth) < 6:
+            return False
+        to_depth = se3.adjoint(se3.inverse(T_i))
+        self._builder.add_edge(kf_i, kf_j, T_i @ found.T_ij @ se3.inverse(T_j), to_depth.T @ found.information @ to_depth)
+        return True
+
+    def around(self, T_wc: np.ndarray, segment: int) -> np.ndarray:
+        """Give the key frames of a segment that stand and look nearly as a camera at T_wc does, nearest first."""
+        table = self._builder.kf
+        apart = np.linalg.norm(table.T_wk[:, :3, 3] - T_wc[:3, 3], axis=1)
+        cosine = table.T_wk[:, :3, 2] @ T_wc[:3, 2]
+        near = np.flatnonzero((table.segment == segment) & (apart < JOIN_M) & (cosine > JOIN_COSINE))
+        return near[np.argsort(apart[near] + (1.0 - cosine[near]), kind="stable")]

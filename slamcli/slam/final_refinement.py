@@ -1,0 +1,146 @@
+"""The second look: key frames by their depth images, then every frame by landmarks, meet the final map again. Only a batch program can."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from slamcli.calibration import rolling_shutter
+from slamcli.calibration.self_calibration import Sensing
+from slamcli.config.options import SensorConfig, TrackConfig
+from slamcli.estimation.bundle_adjustment import BundleResult
+from slamcli.geometry import se3
+from slamcli.geometry.camera import Camera
+from slamcli.schema import KEY_FRAME, LOST, ON_SHAPE, RELOCALISED, Features, Tracks
+from slamcli.slam.depth_tracking import Reliefs, Shape
+from slamcli.slam.localizer import estimate_pose, frame_features
+from slamcli.sparse_map import guided_matching, map_adjustment
+from slamcli.sparse_map.sparse_map import MapBuilder
+
+SHARED = 30  # landmarks of two key frames whose depth images are aligned too
+NEIGHBOURS = 20  # covisible key frames whose landmarks are looked for
+LOST_WIDENING = 8.0  # a lost frame's neighbour stands where a frame's fast turn leaves it, some tens of pixels off
+
+
+def look_again(
+    builder: MapBuilder,
+    tracks: Tracks,
+    sensing: Sensing,
+    sensor: SensorConfig,
+    settings: TrackConfig,
+    *,
+    reliefs: Reliefs,
+    shape_edges: int,
+    shape_weight: float = 1.0,
+    iterations: int,
+    progress,
+) -> tuple[Tracks, BundleResult | None]:
+    """Align each key frame's depth image with those of up to `shape_edges` covisible ones, adjust the map, refine every frame against it.
+
+    builder : its map is changed; its features are those that `sensing` corrected
+    reliefs : of the recording, of which depth images are taken; shape_weight : factor on what they say in the adjustment
+    Returns the refined tracks, and the evidence of the adjustment, None where nothing ties two key frames together.
+    """
+    if shape_edges:
+        T_cd = rolling_shutter.depth_to_colour(builder.features, sensing.timing, builder.kf.frame)
+        reliefs = reliefs.under(sensing.camera)
+        Shape(builder, reliefs, reliefs).join_covisible(T_cd, most=shape_edges, least=SHARED)
+    kfs = np.arange(len(builder.kf), dtype=np.int32)
+    result = map_adjustment.adjust(builder, kfs, sensing.camera, sensor, max_iterations=iterations, edge_weight=shape_weight)
+    tracks = refine_frames(builder, builder.features, tracks, sensing.camera, sensor, settings, progress)
+    return move_key_frames(builder, tracks), result
+
+
+def move_key_frames(builder: MapBuilder, tracks: Tracks) -> Tracks:
+    """Move each key frame to where its frame stands, landmarks staying, and hang all frames on the key frames again.
+
+    The oldest key frame of each segment is its world's origin: instead of it, all else moves.
+    """
+    table, has_pose = builder.kf, tracks.ref_kf >= 0
+    ref, T_wc = tracks.ref_kf[has_pose], np.full(tracks.T_kc.shape, np.nan)
+    T_wc[has_pose] = table.T_wk[ref] @ tracks.T_kc[has_pose]
+    for oldest in np.unique(table.segment, return_index=True)[1]:
+        shift = table.T_wk[oldest] @ se3.inverse(T_wc[table.frame[oldest]])
+        is_here = table.segment == table.segment[oldest]
+        frames = np.flatnonzero(has_pose)[is_here[ref]]
+        T_wc[frames] = shift @ T_wc[frames]
+        ids = np.flatnonzero(builder.lm.is_alive & is_here[builder.lm.first_kf])
+        builder.lm.xyz[ids] = se3.transform(shift, builder.lm.xyz[ids])
+    table.T_wk[:] = T_wc[table.frame]
+    T_kc = np.full(T_wc.shape, np.nan)
+    T_kc[has_pose] = se3.inverse(table.T_wk[ref]) @ T_wc[has_pose]
+    T_kc[table.frame] = np.eye(4)
+    return replace(tracks, T_kc=T_kc)
+
+
+def refine_frames(
+    builder: MapBuilder, features: Features, tracks: Tracks, camera: Camera, sensor: SensorConfig, settings: TrackConfig, progress
+) -> Tracks:
+    """Refine every frame against the landmarks around it; lost ones are tried from both sides.
+
+    features, tracks : of the frames, which may be of another recording than the map
+    A frame keeps its pose where much fewer landmarks agree than before, and a key frame also where so few do that shape held it.
+    Returns new Tracks; the map stays as it is.
+    """
+    look = _Look(builder, features, tracks, camera, sensor, settings)
+    n = len(tracks.state)
+    for i in progress(range(n), "hindsight"):
+        if tracks.state[i] not in (LOST, ON_SHAPE):  # the few landmarks around a frame on shape would make its pose worse
+            look.at(i, look.T_wc[i], int(tracks.ref_kf[i]), least=settings.shape_below if tracks.state[i] == KEY_FRAME else 0)
+    for order, step in ((range(n), -1), (range(n - 1, -1, -1), 1)):
+        for i in order:  # a lost frame begins where its neighbour in time stands
+            j = i + step
+            is_open = look.state[i] == LOST and 0 <= j < n and look.ref_kf[j] >= 0
+            if is_open and look.at(i, look.T_wc[j], int(look.ref_kf[j]), widening=LOST_WIDENING):
+                look.at(i, look.T_wc[i], int(look.ref_kf[i]))
+                look.state[i] = RELOCALISED
+    return Tracks(ref_kf=look.ref_kf, T_kc=look.T_kc, state=look.state, n_inliers=look.n_inliers)
+
+
+class _Look:
+    """The second look at frames, and what it found."""
+
+    def __init__(
+        self, builder: MapBuilder, features: Features, tracks: Tracks, camera: Camera, sensor: SensorConfig, settings: TrackConfig
+    ) -> None:
+        self.builder, self.features, self.camera, self.sensor, self.settings = builder, features, camera, sensor, settings
+        self.T_wc = np.full(tracks.T_kc.shape, np.nan)  # each in the world of its segment
+        has_pose = tracks.ref_kf >= 0
+        self.T_wc[has_pose] = builder.kf.T_wk[tracks.ref_kf[has_pose]] @ tracks.T_kc[has_pose]
+        self.ref_kf, self.T_kc = tracks.ref_kf.copy(), tracks.T_kc.copy()
+        self.state, self.n_inliers = tracks.state.copy(), tracks.n_inliers.copy()
+        self._around: dict[int, tuple] = {}
+
+    def at(self, i: int, T_wc: np.ndarray, kf: int, *, widening: float = 1.0, least: int = 0) -> bool:
+        """Look for frame `i` at `T_wc` among the landmarks around key frame `kf`; False, and nothing changes, if it is not there.
+
+        widening : of the search window, where `T_wc` is a guess; least : landmarks that must agree whatever the settings say
+        """
+        wanted = max(least, self.settings.min_inliers, int(self.n_inliers[i]) // 2)
+        frame, candidates = frame_features(self.features, i, self.camera, self.sensor), self._landmarks_around(kf)
+        feature, _ = guided_matching.search(
+            se3.inverse(T_wc),
+            candidates,
+            frame,
+            self.camera,
+            octave_scale=self.builder.octave_scale,
+            radius_px=widening * self.settings.search_radius_px,
+            max_distance=self.settings.search_max_distance,
+            ratio=self.settings.search_ratio,
+        )
+        which = np.flatnonzero(feature >= 0)
+        if len(which) < wanted:
+            return False
+        estimate = estimate_pose(se3.inverse(T_wc), candidates.xyz[which], frame, feature[which], self.camera)
+        if estimate.n_inliers < wanted:
+            return False
+        self.ref_kf[i], self.n_inliers[i] = kf, estimate.n_inliers
+        self.T_wc[i] = se3.inverse(estimate.T_cw)
+        self.T_kc[i] = se3.inverse(estimate.T_cw @ self.builder.kf.T_wk[kf])
+        return True
+
+    def _landmarks_around(self, kf: int) -> guided_matching.Candidates:
+        if kf not in self._around:
+            neighbours, _ = self.builder.covisible(kf)
+            ids = self.builder.landmarks_in(np.append(neighbours[:NEIGHBOURS], kf))
+            self._around = {kf: self.builder.candidates(ids)}  # frames come in order: the last one is enough
+        return self._around[kf]

@@ -1,0 +1,169 @@
+"""Guided matching: landmarks projected into a frame meet the features near by."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import f4, f8, i4, i8, u1, u8
+
+from slamcli.geometry.bits import hamming
+from slamcli.geometry.camera import Camera
+from slamcli.jit.kernel import kernel
+
+CELL = 20  # px, side of the buckets that features are sorted into
+
+
+@dataclass(frozen=True)
+class FrameFeatures:
+    """The features of one frame, in the form the kernels take."""
+
+    xy: np.ndarray  # (N, 2) float32 px, undistorted
+    depth: np.ndarray  # (N,) float32 m, NaN where there is none or it is not trusted
+    octave: np.ndarray  # (N,) uint8
+    angle: np.ndarray  # (N,) float32 rad
+    desc: np.ndarray  # (N, 4) uint64
+    sigma_px: np.ndarray  # (N,) float64 px
+    sigma_z: np.ndarray  # (N,) float64 m, NaN where depth is
+    first_row: int  # row of feature 0 in the table of all features
+    bucket_start: np.ndarray  # (n_buckets + 1,) int32
+    bucket_rows: np.ndarray  # (N,) int32, features sorted by bucket
+
+    def __len__(self) -> int:
+        return len(self.xy)
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """Landmarks that may be seen, in the form the kernels take."""
+
+    xyz: np.ndarray  # (L, 3) float64 m, world
+    desc: np.ndarray  # (L, 4) uint64
+    direction: np.ndarray  # (L, 3) float64, mean unit vector from the key frames that saw it
+    reach: np.ndarray  # (L,) float64 m, distance at which the landmark appears at octave 0
+
+
+def sort_into_buckets(xy: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Sort features (N, 2) px by square buckets of the image; those undistorted beyond its rim go to the bucket next to them."""
+    columns, rows = -(-camera.width // CELL), -(-camera.height // CELL)
+    column = np.clip(xy[:, 0] // CELL, 0, columns - 1).astype(np.int32)
+    row = np.clip(xy[:, 1] // CELL, 0, rows - 1).astype(np.int32)
+    bucket = row * columns + column
+    start = np.zeros(columns * rows + 1, dtype=np.int32)
+    np.cumsum(np.bincount(bucket, minlength=columns * rows), out=start[1:])
+    return start, np.argsort(bucket, kind="stable").astype(np.int32)
+
+
+def search(
+    T_cw: np.ndarray,
+    candidates: Candidates,
+    frame: FrameFeatures,
+    camera: Camera,
+    *,
+    octave_scale: float,
+    radius_px: float,
+    max_distance: int,
+    ratio: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Match each landmark to the feature most like it near its projection.
+
+    T_cw : (4, 4) world to camera
+    radius_px : window at octave 0; it grows with the octave the landmark should appear in
+    max_distance, ratio : of descriptors [bits]; the ratio is to the second best of the same octave
+    Returns feature : (L,) int32, -1 where none, each feature at most once; is_visible : (L,) bool, the landmark should have been seen.
+    """
+    intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
+    return _search(
+        np.ascontiguousarray(T_cw),
+        candidates.xyz,
+        candidates.desc,
+        candidates.direction,
+        candidates.reach,
+        frame.xy,
+        frame.octave,
+        frame.desc,
+        frame.bucket_start,
+        frame.bucket_rows,
+        intrinsics,
+        camera.width,
+        camera.height,
+        float(octave_scale),
+        float(radius_px),
+        int(max_distance),
+        float(ratio),
+    )
+
+
+@kernel
+def _search(
+    T_cw: f8[:, ::1],
+    xyz: f8[:, ::1],
+    lm_desc: u8[:, ::1],
+    direction: f8[:, ::1],
+    reach: f8[::1],
+    xy: f4[:, ::1],
+    octave: u1[::1],
+    desc: u8[:, ::1],
+    bucket_start: i4[::1],
+    bucket_rows: i4[::1],
+    intrinsics: f8[::1],
+    width: i8,
+    height: i8,
+    octave_scale: f8,
+    radius_px: f8,
+    max_distance: i8,
+    ratio: f8,
+):
+    n_lm, n = len(xyz), len(xy)
+    feature = np.full(n_lm, -1, dtype=np.int32)
+    is_visible = np.zeros(n_lm, dtype=np.bool_)
+    owner = np.full(n, -1, dtype=np.int32)
+    owner_distance = np.full(n, 257, dtype=np.int32)
+    columns, rows = -(-width // CELL), -(-height // CELL)
+    fx, fy, cx, cy = intrinsics
+    centre_x = -(T_cw[0, 0] * T_cw[0, 3] + T_cw[1, 0] * T_cw[1, 3] + T_cw[2, 0] * T_cw[2, 3])
+    centre_y = -(T_cw[0, 1] * T_cw[0, 3] + T_cw[1, 1] * T_cw[1, 3] + T_cw[2, 1] * T_cw[2, 3])
+    centre_z = -(T_cw[0, 2] * T_cw[0, 3] + T_cw[1, 2] * T_cw[1, 3] + T_cw[2, 2] * T_cw[2, 3])
+    log_scale = np.log(octave_scale)
+    for k in range(n_lm):
+        x, y, z = xyz[k, 0], xyz[k, 1], xyz[k, 2]
+        depth = T_cw[2, 0] * x + T_cw[2, 1] * y + T_cw[2, 2] * z + T_cw[2, 3]
+        if not depth > 0.05:
+            continue
+        u = fx * (T_cw[0, 0] * x + T_cw[0, 1] * y + T_cw[0, 2] * z + T_cw[0, 3]) / depth + cx
+        v = fy * (T_cw[1, 0] * x + T_cw[1, 1] * y + T_cw[1, 2] * z + T_cw[1, 3]) / depth + cy
+        if u < 0.0 or v < 0.0 or u >= width or v >= height:
+            continue
+        dx, dy, dz = x - centre_x, y - centre_y, z - centre_z
+        distance = np.sqrt(dx * dx + dy * dy + dz * dz)
+        if dx * direction[k, 0] + dy * direction[k, 1] + dz * direction[k, 2] < 0.5 * distance:
+            continue  # seen from more than 60 degrees aside a patch looks different
+        level = int(np.round(np.log(reach[k] / distance) / log_scale))
+        if level < -2 or level > 9:
+            continue  # much nearer or farther than it was ever seen
+        level = max(level, 0)
+        is_visible[k] = True
+        radius = radius_px * octave_scale**level
+        best, second, best_row, best_octave, second_octave = 257, 257, -1, -1, -1
+        column_to = min(max(int((u + radius) // CELL), 0), columns - 1)
+        column_from = min(max(int((u - radius) // CELL), 0), columns - 1)
+        for row in range(min(max(int((v - radius) // CELL), 0), rows - 1), min(max(int((v + radius) // CELL), 0), rows - 1) + 1):
+            for position in range(bucket_start[row * columns + column_from], bucket_start[row * columns + column_to + 1]):
+                j = bucket_rows[position]
+                if abs(xy[j, 0] - u) > radius or abs(xy[j, 1] - v) > radius:
+                    continue
+                if octave[j] < level - 1 or octave[j] > level + 1:
+                    continue
+                bits = int(hamming(lm_desc, k, desc, j))
+                if bits < best:
+                    second, second_octave = best, best_octave
+                    best, best_octave, best_row = bits, int(octave[j]), j
+                elif bits < second:
+                    second, second_octave = bits, int(octave[j])
+        if best > max_distance or (best_octave == second_octave and best > ratio * second):
+            continue
+        if best >= owner_distance[best_row]:
+            continue
+        if owner[best_row] >= 0:
+            feature[owner[best_row]] = -1
+        owner[best_row], owner_distance[best_row] = k, best
+        feature[k] = best_row
+    return feature, is_visible

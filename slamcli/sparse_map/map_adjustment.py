@@ -1,0 +1,112 @@
+"""Bundle adjustment of a part of the growing map, or of all of it."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from slamcli.config.options import SensorConfig
+from slamcli.depth import noise_model
+from slamcli.estimation import bundle_adjustment
+from slamcli.estimation.relative_pose_factors import Edges
+from slamcli.geometry import se3
+from slamcli.geometry.camera import Camera
+from slamcli.schema import Features
+from slamcli.sparse_map.sparse_map import MapBuilder
+
+
+@dataclass(frozen=True)
+class Measurements:
+    """What the features measured, row by row, and how well."""
+
+    xy: np.ndarray  # (O, 2) px, undistorted
+    depth: np.ndarray  # (O,) m, NaN where there is none or it is not trusted
+    sigma_px: np.ndarray  # (O,) px
+    sigma_z: np.ndarray  # (O,) m, NaN where depth is
+
+
+def measure(features: Features, rows: np.ndarray | slice, sensor: SensorConfig) -> Measurements:
+    """Look up the measurements of feature `rows` (indices or a slice) with their standard deviations."""
+    depth = np.array(features.depth[rows], dtype=np.float64)
+    depth[~((depth >= sensor.depth_min) & (depth <= sensor.depth_max))] = np.nan
+    return Measurements(
+        xy=np.array(features.xy[rows], dtype=np.float64),
+        depth=depth,
+        sigma_px=noise_model.pixel_sigma(features.octave[rows], pixel_noise=sensor.pixel_noise, octave_scale=float(features.octave_scale)),
+        sigma_z=noise_model.depth_sigma(depth, base=sensor.depth_noise_base, quadratic=sensor.depth_noise_quadratic),
+    )
+
+
+@dataclass(frozen=True)
+class Part:
+    """A part of the map as bundle adjustment takes it."""
+
+    kfs: np.ndarray  # (K,) key frames that take part, increasing
+    is_fixed: np.ndarray  # (K,) bool
+    ids: np.ndarray  # (L,) landmarks seen more than once
+    singles: np.ndarray  # landmarks seen once: they bear on nothing and go along with their key frame
+    obs_kf: np.ndarray  # (O,) index into kfs
+    obs_lm: np.ndarray  # (O,) index into ids, increasing
+    row: np.ndarray  # (O,) feature row
+    measured: Measurements
+    edges: Edges  # between key frames of kfs
+
+    @property
+    def arguments(self) -> tuple:
+        """Give what `bundle.adjust` and `bundle.Problem` take between the landmarks and the camera."""
+        return self.obs_kf, self.obs_lm, self.measured.xy, self.measured.depth, self.measured.sigma_px, self.measured.sigma_z
+
+
+def gather(builder: MapBuilder, moving: np.ndarray, sensor: SensorConfig) -> Part:
+    """Gather the key frames `moving` and all they see; key frames outside that see the same, or that edges join to them, are held fixed.
+
+    In a segment where none is held so, the oldest of `moving` is, which fixes the gauge.
+    """
+    ids = builder.landmarks_in(moving)
+    is_single = builder.lm.n_obs[ids] < 2
+    shared = ids[~is_single]
+    obs_lm, obs_kf, row = builder.observations_of(shared)
+    kfs = np.union1d(np.union1d(moving, obs_kf), builder.joined_by_edges(moving))
+    is_fixed = ~np.isin(kfs, moving)
+    segments, oldest = np.unique(builder.kf.segment[kfs], return_index=True)
+    is_fixed[oldest[~np.isin(segments, builder.kf.segment[kfs[is_fixed]])]] = True
+    kf_index = np.searchsorted(kfs, obs_kf).astype(np.int32)
+    is_inside = np.isin(builder.edge.kf, kfs).all(axis=1) & np.isin(builder.edge.kf, moving).any(axis=1)
+    edges = Edges(np.searchsorted(kfs, builder.edge.kf[is_inside]), builder.edge.T_ij[is_inside], builder.edge.information[is_inside])
+    return Part(kfs, is_fixed, shared, ids[is_single], kf_index, obs_lm, row, measure(builder.features, row, sensor), edges)
+
+
+def adjust(
+    builder: MapBuilder, moving: np.ndarray, camera: Camera, sensor: SensorConfig, *, max_iterations: int, edge_weight: float = 1.0
+) -> bundle_adjustment.BundleResult | None:
+    """Adjust the key frames `moving` and all they see, in place, and remove the observations found to be outliers.
+
+    edge_weight : factor on the information of edges between key frames
+    Returns the evidence, or None where nothing ties two key frames together.
+    """
+    part = gather(builder, moving, sensor)
+    if len(part.row) == 0 and len(part.edges) == 0:
+        return None
+    result = bundle_adjustment.adjust(
+        builder.T_kw(part.kfs),
+        builder.lm.xyz[part.ids],
+        *part.arguments,
+        camera,
+        is_fixed=part.is_fixed,
+        edges=replace(part.edges, information=edge_weight * part.edges.information),
+        max_iterations=max_iterations,
+    )
+    before = builder.kf.T_wk[part.kfs].copy()
+    builder.kf.T_wk[part.kfs[~part.is_fixed]] = se3.inverse(result.T_cw[~part.is_fixed])
+    builder.lm.xyz[part.ids] = result.x_w
+    carry(builder, part.singles, part.kfs, before)
+    builder.remove_observations(part.row[~result.is_inlier])
+    return result
+
+
+def carry(builder: MapBuilder, ids: np.ndarray, kfs: np.ndarray, T_wk_before: np.ndarray) -> None:
+    """Move landmarks `ids` rigidly with the key frame that created them, from the poses `T_wk_before` of `kfs` (sorted) to those of now."""
+    of = np.searchsorted(kfs, builder.lm.first_kf[ids])
+    is_known = (of < len(kfs)) & (kfs[np.minimum(of, len(kfs) - 1)] == builder.lm.first_kf[ids])
+    ids, of = ids[is_known], of[is_known]
+    motion = builder.kf.T_wk[kfs] @ se3.inverse(T_wk_before)
+    builder.lm.xyz[ids] = np.einsum("nij,nj->ni", motion[of, :3, :3], builder.lm.xyz[ids]) + motion[of, :3, 3]

@@ -1,0 +1,370 @@
+"""The growing map: key frames, landmarks and observations. The only mutable store of the tracker."""
+
+import numpy as np
+from numba import b1, f8, i4, i8, u1, u8
+
+from slamcli.geometry import se3
+from slamcli.geometry.bits import hamming
+from slamcli.jit.kernel import kernel
+from slamcli.schema import Features, Map
+from slamcli.sparse_map.guided_matching import Candidates
+from slamcli.sparse_map.table import Table
+
+
+class MapBuilder:
+    """Key frames and landmarks with their observations, as flat tables.
+
+    A landmark's observations form a chain through `obs.next`, starting at `lm.head`; -1 ends it. An observation that was removed keeps
+    its place in the chain with `kf` = -1. `lm_of_row` answers the other question: which landmark a feature of a key frame shows.
+    """
+
+    def __init__(self, features: Features):
+        self.features = features
+        self.desc = np.ascontiguousarray(features.desc).view(np.uint64)
+        self.octave = np.ascontiguousarray(features.octave)
+        self.octave_scale = float(features.octave_scale)
+        self.kf = Table(frame=("i4",), segment=("i4",), T_wk=("f8", 4, 4))
+        self.lm = Table(
+            xyz=("f8", 3),
+            desc=("u8", 4),
+            direction=("f8", 3),
+            reach=("f8",),
+            head=("i4",),
+            n_obs=("i4",),
+            n_visible=("i4",),
+            n_found=("i4",),
+            first_kf=("i4",),
+            replaced_by=("i4",),
+            is_alive=("?",),
+        )
+        self.obs = Table(lm=("i4",), kf=("i4",), row=("i8",), next=("i4",))
+        self.edge = Table(kf=("i4", 2), T_ij=("f8", 4, 4), information=("f8", 6, 6))
+        self.lm_of_row = np.full(int(features.offset[-1]), -1, dtype=np.int32)
+
+    def add_key_frame(self, frame: int, T_wk: np.ndarray, segment: int = 0) -> int:
+        """Add a key frame without observations; returns its row."""
+        # Its pose often comes from that of the key frame before, by products and inverses that double the rounding each time.
+        return self.kf.append(1, frame=frame, segment=segment, T_wk=se3.orthonormalise(T_wk)).start
+
+    def add_landmarks(self, kf: int, rows: np.ndarray, xyz: np.ndarray) -> np.ndarray:
+        """Create landmarks at `xyz` (N, 3) [m, world], each seen by key frame `kf` as feature `rows` (N,); returns their ids."""
+        centre = self.kf.T_wk[kf, :3, 3]
+        sight = xyz - centre
+        distance = np.linalg.norm(sight, axis=1)
+        added = self.lm.append(
+            len(rows),
+            xyz=xyz,
+            desc=self.desc[rows],
+            direction=sight / distance[:, None],
+            reach=distance * self.octave_scale ** self.octave[rows].astype(np.float64),
+            head=-1,
+            n_obs=0,
+            n_visible=1,
+            n_found=1,
+            first_kf=kf,
+            replaced_by=-1,
+            is_alive=True,
+        )
+        ids = np.arange(added.start, added.stop, dtype=np.int32)
+        self.observe(kf, ids, rows)
+        return ids
+
+    def observe(self, kf: int, ids: np.ndarray, rows: np.ndarray) -> None:
+        """Note that key frame `kf` sees landmarks `ids` (N,) as features `rows` (N,); neither may be in use in `kf` already."""
+        added = self.obs.append(len(ids), lm=ids, kf=kf, row=rows, next=-1)
+        _link(self.lm.head, self.lm.n_obs, self.obs.next, self.obs.lm, added.start)
+        self.lm_of_row[rows] = ids
+
+    def add_edge(self, kf_i: int, kf_j: int, T_ij: np.ndarray, information: np.ndarray) -> None:
+        """Note that shape says ``x_i = T_ij @ x_j`` of two key frames; information (6, 6) of the left twist of T_ij."""
+        self.edge.append(1, kf=(kf_i, kf_j), T_ij=T_ij, information=information)
+
+    def joined_by_edges(self, kfs: np.ndarray) -> np.ndarray:
+        """Give the key frames (N,) that edges join to any of `kfs`, these themselves left out, increasing."""
+        touches = np.isin(self.edge.kf, kfs)
+        return np.setdiff1d(self.edge.kf[touches.any(axis=1)], kfs).astype(np.int32)
+
+    def rows_of(self, kf: int) -> slice:
+        """Give the feature rows of a key frame."""
+        offset = self.features.offset
+        frame = self.kf.frame[kf]
+        return slice(int(offset[frame]), int(offset[frame + 1]))
+
+    def resolve(self, ids: np.ndarray) -> np.ndarray:
+        """Follow landmarks (N,) to those they were fused into; -1 for none and for the dead."""
+        ids = np.array(ids, dtype=np.int32)
+        while True:
+            moved = (ids >= 0) & (self.lm.replaced_by[ids] >= 0)
+            if not moved.any():
+                break
+            ids[moved] = self.lm.replaced_by[ids[moved]]
+        ids[(ids >= 0) & ~self.lm.is_alive[ids]] = -1
+        return ids
+
+    def votes(self, ids: np.ndarray) -> np.ndarray:
+        """Count for every key frame (K,) how many of the landmarks `ids` it sees."""
+        counts = np.zeros(len(self.kf), dtype=np.int32)
+        _count_views(ids, self.lm.head, self.obs.next, self.obs.kf, counts)
+        return counts
+
+    def landmarks_in(self, kfs: np.ndarray) -> np.ndarray:
+        """Give the landmarks (N,) that any of the key frames sees, increasing."""
+        seen = np.zeros(len(self.lm), dtype=np.bool_)
+        for kf in kfs:
+            ids = self.lm_of_row[self.rows_of(kf)]
+            seen[ids[ids >= 0]] = True
+        return np.flatnonzero(seen).astype(np.int32)
+
+    def landmarks_of(self, kf: int) -> np.ndarray:
+        """Give the landmarks (N,) of one key frame in the order of its features."""
+        ids = self.lm_of_row[self.rows_of(kf)]
+        return ids[ids >= 0]
+
+    def covisible(self, kf: int) -> tuple[np.ndarray, np.ndarray]:
+        """Give the key frames that share landmarks with `kf`, most first, and how many they share."""
+        counts = self.votes(self.landmarks_of(kf))
+        counts[kf] = 0
+        order = np.argsort(-counts, kind="stable")[: np.count_nonzero(counts)]
+        return order.astype(np.int32), counts[order]
+
+    def candidates(self, ids: np.ndarray) -> Candidates:
+        """Give landmarks in the form that guided matching takes."""
+        return Candidates(xyz=self.lm.xyz[ids], desc=self.lm.desc[ids], direction=self.lm.direction[ids], reach=self.lm.reach[ids])
+
+    def observations_of(self, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Give all observations of landmarks `ids`: index into `ids`, key frame, feature row; sorted by (landmark, key frame)."""
+        total = int(self.lm.n_obs[ids].sum())
+        which, kf, row = np.empty(total, np.int32), np.empty(total, np.int32), np.empty(total, np.int64)
+        n = _gather(ids, self.lm.head, self.obs.next, self.obs.kf, self.obs.row, which, kf, row)
+        assert n == total
+        order = np.lexsort((kf, which))
+        return which[order], kf[order], row[order]
+
+    def remove_observations(self, rows: np.ndarray) -> None:
+        """Forget that the features `rows` (N,) of key frames show their landmarks; a landmark without views dies."""
+        _unlink(rows, self.lm_of_row, self.lm.head, self.lm.n_obs, self.lm.is_alive, self.obs.next, self.obs.kf, self.obs.row)
+
+    def remove_landmarks(self, ids: np.ndarray) -> None:
+        """Remove landmarks with all their observations."""
+        _, _, rows = self.observations_of(ids)
+        self.remove_observations(rows)
+        self.lm.is_alive[ids] = False
+
+    def fuse(self, kept: int, gone: int) -> None:
+        """Merge landmark `gone` into `kept`: its views move over, save where a key frame sees `kept` already."""
+        _fuse(kept, gone, self.lm_of_row, self.lm.head, self.lm.n_obs, self.obs.next, self.obs.lm, self.obs.kf, self.obs.row)
+        self.lm.n_visible[kept] += self.lm.n_visible[gone]
+        self.lm.n_found[kept] += self.lm.n_found[gone]
+        self.lm.is_alive[gone] = False
+        self.lm.replaced_by[gone] = kept
+
+    def refresh(self, ids: np.ndarray) -> None:
+        """Recompute what guided matching needs of landmarks `ids`: descriptor, viewing direction, reach."""
+        _refresh(
+            ids,
+            self.lm.head,
+            self.obs.next,
+            self.obs.kf,
+            self.obs.row,
+            self.lm.xyz,
+            self.kf.T_wk,
+            self.desc,
+            self.octave,
+            self.octave_scale,
+            self.lm.desc,
+            self.lm.direction,
+            self.lm.reach,
+        )
+
+    def snapshot(self) -> Map:
+        """Give the map as an artefact: living landmarks, renumbered."""
+        ids = np.flatnonzero(self.lm.is_alive & (self.lm.n_obs > 0)).astype(np.int32)
+        which, kf, row = self.observations_of(ids)
+        return Map(
+            kf_frame=self.kf.frame.copy(),
+            kf_segment=self.kf.segment.copy(),
+            T_wk=self.kf.T_wk.copy(),
+            lm_xyz=self.lm.xyz[ids],
+            obs_lm=which,
+            obs_kf=kf,
+            obs_row=row,
+            edge_kf=self.edge.kf.copy(),
+            edge_T_ij=self.edge.T_ij.copy(),
+            edge_information=self.edge.information.copy(),
+        )
+
+    @classmethod
+    def from_map(cls, features: Features, map_: Map) -> "MapBuilder":
+        """Rebuild the growing form of a map."""
+        self = cls(features)
+        n_kf, n_lm = len(map_.kf_frame), len(map_.lm_xyz)
+        self.kf.append(n_kf, frame=map_.kf_frame, segment=map_.kf_segment, T_wk=map_.T_wk)
+        first = np.searchsorted(map_.obs_lm, np.arange(n_lm))
+        first_kf = map_.obs_kf[first] if n_lm else np.empty(0, np.int32)
+        self.lm.append(
+            n_lm,
+            xyz=map_.lm_xyz,
+            desc=0,
+            direction=0.0,
+            reach=0.0,
+            head=-1,
+            n_obs=0,
+            n_visible=1,
+            n_found=1,
+            first_kf=first_kf,
+            replaced_by=-1,
+            is_alive=True,
+        )
+        self.obs.append(len(map_.obs_lm), lm=map_.obs_lm, kf=map_.obs_kf, row=map_.obs_row, next=-1)
+        _link(self.lm.head, self.lm.n_obs, self.obs.next, self.obs.lm, 0)
+        self.lm_of_row[map_.obs_row] = map_.obs_lm
+        self.edge.append(len(map_.edge_kf), kf=map_.edge_kf, T_ij=map_.edge_T_ij, information=map_.edge_information)
+        self.refresh(np.arange(n_lm, dtype=np.int32))
+        return self
+
+    def centres(self) -> np.ndarray:
+        """Give the camera centres (K, 3) of the key frames [m, world]."""
+        return self.kf.T_wk[:, :3, 3]
+
+    def T_kw(self, kfs: np.ndarray) -> np.ndarray:
+        """Give world-to-camera transforms (N, 4, 4) of key frames."""
+        return se3.inverse(self.kf.T_wk[kfs])
+
+
+@kernel
+def _link(head: i4[::1], n_obs: i4[::1], next_: i4[::1], obs_lm: i4[::1], start: i8):
+    for o in range(start, len(obs_lm)):
+        lm = obs_lm[o]
+        next_[o] = head[lm]
+        head[lm] = o
+        n_obs[lm] += 1
+
+
+@kernel
+def _count_views(ids: i4[::1], head: i4[::1], next_: i4[::1], obs_kf: i4[::1], counts: i4[::1]):
+    for lm in ids:
+        o = head[lm]
+        while o >= 0:
+            if obs_kf[o] >= 0:
+                counts[obs_kf[o]] += 1
+            o = next_[o]
+
+
+@kernel
+def _gather(ids: i4[::1], head: i4[::1], next_: i4[::1], obs_kf: i4[::1], obs_row: i8[::1], which: i4[::1], kf: i4[::1], row: i8[::1]):
+    n = 0
+    for i in range(len(ids)):
+        o = head[ids[i]]
+        while o >= 0:
+            if obs_kf[o] >= 0:
+                which[n], kf[n], row[n] = i, obs_kf[o], obs_row[o]
+                n += 1
+            o = next_[o]
+    return n
+
+
+@kernel
+def _unlink(
+    rows: i8[::1], lm_of_row: i4[::1], head: i4[::1], n_obs: i4[::1], is_alive: b1[::1], next_: i4[::1], obs_kf: i4[::1], obs_row: i8[::1]
+):
+    for row in rows:
+        lm = lm_of_row[row]
+        if lm < 0:
+            continue
+        o = head[lm]
+        while o >= 0:
+            if obs_kf[o] >= 0 and obs_row[o] == row:
+                obs_kf[o] = -1
+                n_obs[lm] -= 1
+                break
+            o = next_[o]
+        lm_of_row[row] = -1
+        if n_obs[lm] == 0:
+            is_alive[lm] = False
+
+
+@kernel
+def _fuse(
+    kept: i8,
+    gone: i8,
+    lm_of_row: i4[::1],
+    head: i4[::1],
+    n_obs: i4[::1],
+    next_: i4[::1],
+    obs_lm: i4[::1],
+    obs_kf: i4[::1],
+    obs_row: i8[::1],
+):
+    o = head[gone]
+    while o >= 0:
+        following = next_[o]
+        if obs_kf[o] >= 0:
+            clash = False
+            p = head[kept]
+            while p >= 0:
+                if obs_kf[p] == obs_kf[o]:
+                    clash = True
+                    break
+                p = next_[p]
+            if clash:
+                lm_of_row[obs_row[o]] = -1
+                obs_kf[o] = -1
+            else:
+                lm_of_row[obs_row[o]] = kept
+                obs_lm[o] = kept
+                next_[o] = head[kept]
+                head[kept] = o
+                n_obs[kept] += 1
+        o = following
+    head[gone] = -1
+    n_obs[gone] = 0
+
+
+@kernel
+def _refresh(
+    ids: i4[::1],
+    head: i4[::1],
+    next_: i4[::1],
+    obs_kf: i4[::1],
+    obs_row: i8[::1],
+    xyz: f8[:, ::1],
+    T_wk: f8[:, :, ::1],
+    desc: u8[:, ::1],
+    octave: u1[::1],
+    octave_scale: f8,
+    lm_desc: u8[:, ::1],
+    direction: f8[:, ::1],
+    reach: f8[::1],
+):
+    # Views beyond the latest 16 add nothing to the mean direction and would make the medoid quadratic in a landmark's life.
+    rows = np.empty(16, dtype=np.int64)
+    for lm in ids:
+        n = 0
+        sx = sy = sz = 0.0
+        nearest = np.inf
+        o = head[lm]
+        while o >= 0 and n < 16:
+            if obs_kf[o] >= 0:
+                kf = obs_kf[o]
+                dx, dy, dz = xyz[lm, 0] - T_wk[kf, 0, 3], xyz[lm, 1] - T_wk[kf, 1, 3], xyz[lm, 2] - T_wk[kf, 2, 3]
+                distance = np.sqrt(dx * dx + dy * dy + dz * dz) + 1e-12
+                sx, sy, sz = sx + dx / distance, sy + dy / distance, sz + dz / distance
+                if distance < nearest:
+                    nearest = distance
+                    reach[lm] = distance * octave_scale ** float(octave[obs_row[o]])
+                rows[n] = obs_row[o]
+                n += 1
+            o = next_[o]
+        if n == 0:
+            continue
+        norm = np.sqrt(sx * sx + sy * sy + sz * sz) + 1e-12
+        direction[lm, 0], direction[lm, 1], direction[lm, 2] = sx / norm, sy / norm, sz / norm
+        best, best_sum = rows[0], 1 << 30
+        for a in range(n):  # medoid: the descriptor nearest to all others
+            total = 0
+            for b in range(n):
+                total += int(hamming(desc, rows[a], desc, rows[b]))
+            if total < best_sum:
+                best, best_sum = rows[a], total
+        for i in range(4):
+            lm_desc[lm, i] = desc[best, i]

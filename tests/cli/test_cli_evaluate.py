@@ -1,0 +1,171 @@
+"""slamcli eval and export-trajectory, on a run whose errors are known."""
+
+import csv
+import io
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import finished
+import numpy as np
+import pytest
+from click.testing import Result
+
+from slamcli.evaluation import trajectory_error
+from slamcli.formats.trajectory import read_tum, write_tum
+from slamcli.runs.run_directory import RunDir
+from slamcli.schema import Ground
+
+Command = Callable[..., Result]
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> finished.Finished:
+    return finished.make(tmp_path_factory.mktemp("finished"))
+
+
+def test_ape_as_json(slamcli: Command, made: finished.Finished) -> None:
+    result = slamcli("eval", "ape", "-r", made.run, "--json")
+    assert result.exit_code == 0
+    figures = json.loads(result.stdout)
+    assert {"rmse", "mean", "median", "max", "n_poses", "n_frames", "coverage", "scale", "rmse_scaled"} <= figures.keys()
+    assert figures["stage"] == "loop"
+    assert (figures["n_poses"], figures["n_frames"], figures["lost"]) == (84, 90, 6)
+    assert 0.006 < figures["rmse"] < 0.011  # 0.005 m along three axes
+    assert figures["rmse_scaled"] <= figures["rmse"]
+    assert json.loads((made.run / "eval" / "ape.json").read_text()) == figures
+
+
+def test_ape_of_each_stage_is_that_of_its_trajectory_file(slamcli: Command, made: finished.Finished) -> None:
+    rmse = {}
+    for stage in trajectory_error.STAGES:
+        figures = json.loads(slamcli("eval", "ape", "-r", made.run, "--stage", stage, "--json").stdout)
+        file = trajectory_error.ape(read_tum(made.run / stage / "trajectory.txt"), made.truth, n_frames=90, name="file")
+        assert figures["rmse"] == pytest.approx(file.to_dict()["rmse"], abs=1e-9)
+        rmse[stage] = figures["rmse"]
+    assert rmse["loop"] < rmse["track"]
+
+
+def test_all_stages_in_one_table(slamcli: Command, made: finished.Finished) -> None:
+    rows = json.loads(slamcli("eval", "ape", "-r", made.run, "--stage", "all", "--json").stdout)
+    assert [row["stage"] for row in rows] == ["track", "optimize", "loop"]
+    assert json.loads((made.run / "eval" / "ape.json").read_text()) == rows[-1]
+
+
+def test_run_that_may_not_be_written_to(slamcli: Command, made: finished.Finished, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(made.run, run, ignore=shutil.ignore_patterns("eval"))
+    (run / "eval").write_text("a file where the folder should be")
+    result = slamcli("eval", "ape", "-r", run, "--json")
+    assert result.exit_code == 0
+    assert json.loads(result.stdout)["n_frames"] == 90
+    assert "cannot be written" in result.stderr
+
+
+def test_last_stage_there_is(slamcli: Command, tmp_path: Path) -> None:
+    part = finished.make(tmp_path, until="track", frames=30, n_lost=0)
+    assert json.loads(slamcli("eval", "ape", "-r", part.run, "--json").stdout)["stage"] == "track"
+    result = slamcli("eval", "ape", "-r", part.run, "--stage", "loop")
+    assert result.exit_code == 1
+    assert "loop has not been run; try: slamcli run --until loop" in result.stderr
+
+
+def test_nothing_tracked_yet(slamcli: Command, tmp_path: Path) -> None:
+    part = finished.make(tmp_path, until="match", frames=30, n_lost=0)
+    result = slamcli("eval", "ape", "-r", part.run)
+    assert result.exit_code == 1 and "slamcli run --until track" in result.stderr
+
+
+def test_no_ground_truth(slamcli: Command, tmp_path: Path) -> None:
+    made = finished.make(tmp_path, with_truth=False, frames=30, n_lost=0)
+    for metric in ("ape", "rpe"):
+        result = slamcli("eval", metric, "-r", made.run)
+        assert result.exit_code == 1
+        assert "no ground truth" in result.stderr and len(result.stderr.splitlines()) == 1
+
+
+def test_too_few_poses(slamcli: Command, tmp_path: Path) -> None:
+    made = finished.make(tmp_path, frames=12, n_lost=6)
+    part = finished.make(tmp_path / "b", frames=2, n_lost=0)
+    assert slamcli("eval", "ape", "-r", made.run).exit_code == 0
+    result = slamcli("eval", "ape", "-r", part.run)
+    assert result.exit_code == 1 and "too few" in result.stderr
+
+
+def test_several_runs_in_one_table(slamcli: Command, made: finished.Finished, here: Path) -> None:
+    shutil.copytree(made.run, here / "runs" / "a_1")
+    shutil.copytree(made.run, here / "runs" / "b")
+    text = slamcli("eval", "ape", "runs/a_1", "runs/b").stdout
+    assert [line.split()[0] for line in text.splitlines()] == ["trajectory", "a_1", "b"]
+    rows = list(csv.DictReader(io.StringIO(slamcli("eval", "ape", "runs/a_1", "runs/b", "--style", "csv").stdout)))
+    assert [row["name"] for row in rows] == ["a_1", "b"]
+    assert float(rows[0]["rmse"]) == json.loads((here / "runs/a_1/eval/ape.json").read_text())["rmse"]
+    latex = slamcli("eval", "ape", "runs/a_1", "runs/b", "--style", "latex").stdout
+    assert r"a\_1 & loop" in latex and r"93.3\%" in latex and latex.count(r"\\") == 3
+    assert len(json.loads(slamcli("eval", "ape", "runs/a_1", "runs/b", "--json").stdout)) == 2
+    assert slamcli("eval", "ape", "runs/a_1", "-r", "runs/b").exit_code == 2
+
+
+def test_other_systems_stand_beside(slamcli: Command, made: finished.Finished, tmp_path: Path) -> None:
+    rng = np.random.default_rng(3)
+    write_tum(tmp_path / "theirs.txt", finished.disturb(rng, made.truth, metres=0.1))
+    ours, theirs = json.loads(slamcli("eval", "ape", "-r", made.run, "--other", f"Theirs={tmp_path / 'theirs.txt'}", "--json").stdout)
+    assert theirs["name"] == "Theirs" and theirs["rmse"] > 5 * ours["rmse"] and theirs["coverage"] == 1.0
+    assert slamcli("eval", "ape", "-r", made.run, "--other", "no-equals-sign").exit_code == 2
+    missing = slamcli("eval", "ape", "-r", made.run, "--other", f"A={tmp_path / 'none.txt'}")
+    assert missing.exit_code == 1 and "none.txt" in missing.stderr
+
+
+def test_rpe(slamcli: Command, made: finished.Finished) -> None:
+    figures = json.loads(slamcli("eval", "rpe", "-r", made.run, "--json").stdout)
+    assert (figures["unit"], figures["delta"], figures["per_frame"]["unit"]) == ("s", 1.0, "frame")
+    assert 0.008 < figures["rmse"] < 0.017  # two poses with 0.005 m along three axes
+    assert figures["per_frame"]["n_pairs"] == 82  # 84 poses in two pieces
+    assert json.loads((made.run / "eval" / "rpe.json").read_text()) == figures
+    lines = slamcli("eval", "rpe", "-r", made.run).stdout.splitlines()
+    assert len(lines) == 3
+
+
+@pytest.mark.parametrize("metric", ["ape", "rpe"])
+def test_plot_shows_something(slamcli: Command, made: finished.Finished, tmp_path: Path, metric: str) -> None:
+    file = tmp_path / "plot.png"
+    assert slamcli("eval", metric, "-r", made.run, "--plot", file).exit_code == 0
+    picture = cv2.imread(str(file))
+    assert min(picture.shape[:2]) > 500
+    assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 50
+    assert slamcli("eval", metric, "-r", made.run, "--plot", tmp_path / "plot.xyz").exit_code == 1
+    result = slamcli("eval", metric, "-r", made.run, "--plot", tmp_path / "nowhere" / "plot.png")
+    assert result.exit_code == 1 and "nowhere" in result.stderr
+
+
+def test_export_trajectory(slamcli: Command, made: finished.Finished, tmp_path: Path) -> None:
+    assert slamcli("export-trajectory", tmp_path / "t.txt", "-r", made.run).exit_code == 0
+    assert (tmp_path / "t.txt").read_text() == (made.run / "loop" / "trajectory.txt").read_text()
+    assert slamcli("export-trajectory", tmp_path / "level.txt", "-r", made.run, "--frame", "level").exit_code == 0
+    T_lw = RunDir.find(str(made.run)).load(Ground, "densify").T_lw
+    expected = T_lw @ read_tum(tmp_path / "t.txt").T_wc
+    np.testing.assert_allclose(read_tum(tmp_path / "level.txt").T_wc, expected, atol=1e-7)
+    result = slamcli("export-trajectory", tmp_path / "k.txt", "-r", made.run, "--format", "kitti")
+    assert np.loadtxt(tmp_path / "k.txt").shape == (84, 12)
+    assert "84 poses of 90 frames" in result.stderr and "not frame numbers" in result.stderr
+    assert slamcli("export-trajectory", tmp_path / "no" / "t.txt", "-r", made.run).exit_code == 1
+
+
+def test_map_against_the_depth_images_and_the_scene(slamcli: Command, room_run: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(room_run, run)
+    figures = json.loads(slamcli("eval", "map", "-r", run, "--json").stdout)
+    assert 0.9 < figures["octree"]["accuracy"] <= 1.0
+    assert 0.5 < figures["grid"]["free_is_free"] <= 1.0
+    assert json.loads((run / "eval" / "map.json").read_text()) == figures
+    text = slamcli("eval", "map", "-r", run).stdout
+    assert "of the cells seen are right" in text
+    assert "called free are free" in text
+
+
+def test_map_needs_an_octree(slamcli: Command, made: finished.Finished) -> None:
+    result = slamcli("eval", "map", "-r", made.run)
+    assert result.exit_code == 1
+    assert "octree has not been run" in result.stderr

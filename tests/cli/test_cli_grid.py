@@ -1,0 +1,232 @@
+"""export-grid and plan from the command line, and the stage itself, on runs put together without any SLAM."""
+
+import json
+
+import cv2
+import finished
+import numpy as np
+import pytest
+from boxroom import HANGING, KINECT, kinect_noise, look_along, render, round_trip
+
+from slamcli import artifacts
+from slamcli.config.options import Config, GridConfig
+from slamcli.errors import BadFrame
+from slamcli.formats import grid_map, octomap
+from slamcli.geometry import se3
+from slamcli.runs import pipeline
+from slamcli.runs.run_directory import RunDir
+from slamcli.schema import Features, Grid, Ground, Map, Timing, Tracks
+from slamcli.stages import grid2d, stage_named
+
+
+def room_grid():
+    """5 m x 4 m with a wall across that leaves a gap; origin (-1, -0.5)."""
+    state = np.zeros((80, 100), np.int8)
+    state[[0, -1]], state[:, [0, -1]] = 1, 1
+    state[:50, 50] = 1
+    state[70:, 80:] = -1
+    p = np.where(state < 0, np.nan, state).astype(np.float32)
+    return Grid(p, (state >= 0).astype(np.int32), state, np.array([-1.0, -0.5]), np.array(0.05))
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A run whose grid is known."""
+    made = finished.make(tmp_path_factory.mktemp("runs"), frames=60, until="octree")
+    folder = RunDir(made.run)
+    with folder.writing("grid2d") as out:
+        artifacts.save(room_grid(), out)
+        folder.commit("grid2d", out, finished._record(folder, stage_named("grid2d"), out, 60))
+    return made.run
+
+
+def test_export_grid_writes_map_page_and_picture(run, here, slamcli):
+    result = slamcli("export-grid", "map.pgm", "--png", "map.png", "-r", run)
+    assert result.exit_code == 0
+    assert "map.pgm" in result.stderr and "100 x 80 cells of 0.05 m" in result.stderr
+    read = grid_map.read(here / "map.yaml")
+    np.testing.assert_array_equal(read.state, room_grid().state)
+    assert read.origin == (-1.0, -0.5)
+    picture = cv2.imread(str(here / "map.png"))
+    assert min(picture.shape[:2]) > 300
+    assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 5  # cells, trajectory, legend
+
+
+@pytest.mark.parametrize("name", ["map.png", "map", "map.PGM.txt"])
+def test_export_grid_wants_a_pgm(run, here, slamcli, name):
+    result = slamcli("export-grid", name, "-r", run)
+    assert result.exit_code == 1
+    assert "ends in .pgm" in result.stderr
+
+
+def test_export_grid_into_no_folder(run, here, slamcli):
+    result = slamcli("export-grid", "nowhere/map.pgm", "-r", run)
+    assert result.exit_code == 1
+    assert "nowhere/map.pgm: cannot be written" in result.stderr
+
+
+def test_plan_prints_csv_and_draws(run, here, slamcli):
+    result = slamcli("plan", "--start", "0,0.5", "--goal", "2.5,0.5", "-r", run, "--png", "plan.png")
+    assert result.exit_code == 0
+    rows = [line.split(",") for line in result.stdout.splitlines()]
+    assert rows[0] == ["x", "y", "clearance"]
+    xy = np.array(rows[1:], float)
+    np.testing.assert_allclose(xy[[0, -1], :2], [(0.0, 0.5), (2.5, 0.5)])
+    assert xy[:, 1].max() > 2.2  # round the wall's end at y = 2.0
+    assert (xy[:, 2] >= 0.0).all()
+    assert cv2.imread("plan.png") is not None
+
+
+def test_plan_as_json_and_into_files(run, here, slamcli):
+    arguments = ("plan", "--start", "0,0.5", "--goal", "2.5,0.5", "-r", run, "--png", "p.png")
+    about = json.loads(slamcli(*arguments, "--json", "-o", "path.csv").stdout)
+    assert about["frame"] == "level"
+    assert about["points"][0] == [0.0, 0.5]
+    assert len(about["points"]) == len(about["clearance"])
+    assert about["length"] == pytest.approx(np.linalg.norm(np.diff(about["points"], axis=0), axis=1).sum(), abs=0.01)
+    csv = (here / "path.csv").read_text().splitlines()
+    assert len(csv) == 1 + len(about["points"])
+    assert slamcli(*arguments, "-o", "path.txt").exit_code == 1
+
+
+def test_plan_draws_into_the_run_by_default(run, here, slamcli):
+    assert slamcli("plan", "--start", "0,0.5", "--goal", "1,0.5", "-r", run).exit_code == 0
+    assert (run / "plan.png").stat().st_size > 1000
+
+
+def test_plan_on_a_map_of_someone_else(run, here, slamcli):
+    slamcli("export-grid", "map.pgm", "-r", run)
+    result = slamcli("plan", "--map", "map.yaml", "--start", "0,0.5", "--goal", "2.5,0.5")
+    assert result.exit_code == 0
+    assert result.stdout == slamcli("plan", "--start", "0,0.5", "--goal", "2.5,0.5", "-r", run, "--png", "p.png").stdout
+
+
+@pytest.mark.parametrize(
+    ("start", "goal", "more", "code", "says"),
+    [
+        ("0,0.5", "9,9", (), 1, "goal 9,9: outside the grid, which covers x -1.00 to 4.00 m"),
+        ("0,0.5", "1.52,0.5", (), 1, "goal 1.52,0.5: inside an obstacle; the nearest place"),
+        ("0,0.5", "3.5,3.2", (), 1, "in unknown space"),
+        ("0,0.5", "2.5,0.5", ("--radius", "1.2"), 1, "robot"),
+        ("0,0.5", "2.5,0.5", ("--radius", "-1"), 1, "radius = -1"),
+        ("0", "2.5,0.5", (), 2, "'0' is not a place such as 0.5,1.0"),
+        ("a,b", "2.5,0.5", (), 2, "is not a place"),
+    ],
+)
+def test_plan_says_what_is_wrong(run, here, slamcli, start, goal, more, code, says):
+    result = slamcli("plan", "--start", start, "--goal", goal, "-r", run, *more)
+    assert result.exit_code == code
+    assert says in result.stderr
+    assert result.stdout == ""
+
+
+def test_plan_through_unknown_space_when_allowed(run, here, slamcli):
+    assert slamcli("plan", "--start", "0,0.5", "--goal", "3.5,3.2", "-r", run, "--allow-unknown", "--png", "p.png").exit_code == 0
+
+
+def test_a_run_without_a_grid_says_how_to_make_one(tmp_path, slamcli):
+    made = finished.make(tmp_path, frames=60, until="octree")
+    result = slamcli("export-grid", tmp_path / "map.pgm", "-r", made.run)
+    assert result.exit_code == 1
+    assert "grid2d has not been run; try: slamcli run --until grid2d" in result.stderr
+
+
+class Recording:
+    """Depth of the analytic room, one image of which is broken and one missing."""
+
+    def __init__(self, T_lc):
+        rng = np.random.default_rng(0)
+        self._depth = [kinect_noise(render(T), rng) for T in T_lc]
+
+    def depth(self, i, camera):
+        if i == 3:
+            raise BadFrame("depth/3.png: cannot be decoded")
+        return None if i == 4 else self._depth[i]
+
+    def __len__(self):
+        return len(self._depth)
+
+
+class Inputs:
+    def __init__(self, folder, T_lc, is_found=True):
+        n = len(T_lc)
+        T_wl = se3.exp(np.array([1.0, 2.0, 3.0, 0.3, 0.2, 0.1]))
+        T_lw = se3.inverse(T_wl)
+        plane = np.append(T_lw[2, :3], T_lw[2, 3])
+        lost = np.arange(n) == 7
+        T_kc = np.tile(np.eye(4), (n, 1, 1))
+        T_kc[lost] = np.nan
+        stamp, empty = 0.2 * np.arange(n), np.empty(0)
+        self._values = {
+            Features: Features(
+                stamp,
+                stamp,
+                np.zeros(n + 1, np.int64),
+                np.empty((0, 2), np.float32),
+                empty.astype("f4"),
+                np.empty((0, 2), np.float32),
+                *[empty.astype(t) for t in ("u1", "f4")],
+                np.empty((0, 32), np.uint8),
+                np.array(1.2),
+            ),
+            Ground: Ground(T_lw, plane, np.array(0.01), np.array(0.9), np.array(is_found)),
+            Timing: Timing(np.array(0.0), np.array(0.0), np.array(0.0), np.zeros((n, 6))),
+            Tracks: Tracks(np.where(lost, -1, np.arange(n)).astype(np.int32), T_kc, np.ones(n, np.uint8), np.full(n, 99, np.int32)),
+            Map: Map(
+                np.arange(n, dtype=np.int32),
+                np.zeros(n, np.int32),
+                T_wl @ T_lc,
+                np.empty((0, 3)),
+                *(np.empty(0, t) for t in (np.int32, np.int32, np.int64)),
+            ),
+        }
+        self.dataset, self._folder = Recording(T_lc), folder
+
+    def load(self, cls, stage):
+        return self._values[cls]
+
+    def camera(self, stage="extract"):
+        return KINECT
+
+    def path(self, stage, *names):
+        return self._folder.joinpath(stage, *names)
+
+
+def run_stage(tmp_path, inputs, **changes):
+    config = Config(grid2d=GridConfig(**{"stride": 1, "min_range": 0.5, **changes}))
+    out = tmp_path / "out"
+    out.mkdir(exist_ok=True)
+    tools = pipeline.Tools("grid2d", config)
+    summary = grid2d.run(inputs, out, pipeline.Settings(stage_named("grid2d"), config), tools)
+    return summary, out, tools
+
+
+def test_the_stage_writes_grid_and_map_alike(tmp_path):
+    summary, out, tools = run_stage(tmp_path, Inputs(tmp_path, round_trip(step=0.4, turn=0.3)))
+    made = artifacts.load(Grid, out)
+    read = grid_map.read(out / "map.yaml")
+    np.testing.assert_array_equal(read.state, made.state)
+    assert read.origin == tuple(made.origin)
+    assert summary["free"] == (made.state == 0).sum() > 8000
+    assert summary["occupied"] == (made.state == 1).sum() > 500
+    assert tools.warnings == ["depth/3.png: cannot be decoded"]
+    row, column = np.floor((np.array(HANGING)[:, 1::-1].mean(axis=0) - made.origin[::-1]) / 0.05).astype(int)
+    assert made.state[row, column] != 0
+
+
+def test_the_stage_warns_when_no_floor_was_found_or_seen(tmp_path):
+    T = np.stack([look_along([4.0, 2.5, 0.8], a, -0.5) for a in np.arange(0.0, 6.0, 0.5)])
+    summary, _, tools = run_stage(tmp_path, Inputs(tmp_path, T, is_found=False))
+    assert not summary["floor"]
+    assert any("no floor was found" in warning for warning in tools.warnings)
+    assert any("no free cell" in warning for warning in tools.warnings)
+
+
+def test_the_stage_reads_the_octree(tmp_path):
+    from octrees import hanging_box, tree_of
+
+    (tmp_path / "octree").mkdir()
+    octomap.write_ot(tmp_path / "octree" / "map.ot", tree_of(hanging_box(hollow=False)))
+    summary, out, _ = run_stage(tmp_path, Inputs(tmp_path, round_trip(step=2.0, turn=2.0)), source="octree")
+    assert summary["columns"] == summary["rows"] == 40
+    assert artifacts.load(Grid, out).state[20, 24] == 1

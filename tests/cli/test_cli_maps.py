@@ -1,0 +1,100 @@
+"""Exports and pictures, from a run whose densify and octree are small and known."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial import KDTree
+
+from slamcli.dense.occupancy import OccupancyMap
+from slamcli.formats import cloud, octomap
+from slamcli.geometry import se3
+from slamcli.geometry.octree import prune
+from slamcli.runs.run_directory import RunDir
+from slamcli.schema import Ground
+
+
+@pytest.fixture(scope="module")
+def known(room_run: Path) -> RunDir:
+    return RunDir.find(str(room_run))
+
+
+def test_export_cloud_gives_the_stages_points_in_either_frame_and_format(slamcli: Callable, known: RunDir, tmp_path: Path) -> None:
+    xyz, rgb, normal = cloud.read(known.stage_path("densify", "cloud.ply"))
+    T_lw = known.load(Ground, "densify").T_lw
+    for name in ("cloud.ply", "cloud.pcd"):
+        for frame, T in (("level", np.eye(4)), ("world", se3.inverse(T_lw))):
+            result = slamcli("export-cloud", tmp_path / name, "-r", known.path, "--frame", frame)
+            assert result.exit_code == 0 and f"{len(xyz)} points" in result.stderr
+            found = cloud.read(tmp_path / name)
+            np.testing.assert_allclose(found[0], se3.transform(T, xyz.astype(float)), atol=1e-5)
+            assert np.array_equal(found[1], rgb)
+            np.testing.assert_allclose(found[2], normal @ T[:3, :3].T, atol=1e-5)
+
+
+@pytest.mark.parametrize("suffix", ["bt", "ot"])
+def test_export_octree_gives_the_stages_file(slamcli: Callable, known: RunDir, suffix: str, tmp_path: Path) -> None:
+    out = tmp_path / f"my.{suffix}"
+    assert slamcli("export-octree", out, "-r", known.path).exit_code == 0
+    assert out.read_bytes() == known.stage_path("octree", f"map.{suffix}").read_bytes()
+    assert len(octomap.read(out)) > 100
+
+
+def test_export_octree_with_colours_is_the_same_tree(slamcli: Callable, known: RunDir, tmp_path: Path) -> None:
+    assert slamcli("export-octree", tmp_path / "map.ot", "-r", known.path, "--colour").exit_code == 0
+    assert b"id ColorOcTree" in (tmp_path / "map.ot").read_bytes()[:300]
+    ours, plain = octomap.read(tmp_path / "map.ot"), octomap.read(known.stage_path("octree", "map.ot"))
+    assert np.array_equal(ours.key, plain.key) and np.array_equal(ours.log_odds, plain.log_odds)
+
+
+def test_export_mesh_makes_a_surface_of_the_level_frame(slamcli: Callable, known: RunDir, tmp_path: Path) -> None:
+    result = slamcli("export-mesh", tmp_path / "mesh.ply", "-r", known.path, "--voxel", 0.05)
+    assert result.exit_code == 0 and "triangles" in result.stderr
+    mesh, points = cloud.read(tmp_path / "mesh.ply")[0], cloud.read(known.stage_path("densify", "cloud.ply"))[0]
+    assert np.median(KDTree(mesh).query(points)[0]) < 0.04
+
+
+@pytest.mark.parametrize("what", ["cloud", "octree"])
+def test_render_draws_the_map(slamcli: Callable, known: RunDir, what: str, tmp_path: Path) -> None:
+    out = tmp_path / "picture.png"
+    assert slamcli("render", out, "-r", known.path, "--what", what, "--size", 320, 200, "--path").exit_code == 0
+    image = cv2.imread(str(out))
+    assert image.shape == (200, 320, 3)
+    assert len(np.unique(image.reshape(-1, 3), axis=0)) > 100
+
+
+@pytest.mark.parametrize(
+    ("command", "message"),
+    [
+        (("export-cloud", "cloud.xyz"), "must end in .ply or .pcd"),
+        (("export-octree", "map.png"), "must end in .bt or .ot"),
+        (("export-octree", "map.bt", "--colour"), "no room for colours"),
+        (("export-mesh", "mesh.obj"), "must end in .ply"),
+        (("render", "picture.gif"), "must end in .png or .jpg"),
+        (("export-octree", "no/such/folder/map.bt"), "No such file"),
+    ],
+)
+def test_what_cannot_be_written_is_said_in_one_line(slamcli: Callable, known: RunDir, here: Path, command: tuple, message: str) -> None:
+    result = slamcli(*command, "-r", known.path)
+    assert result.exit_code == 1
+    assert message in result.stderr and len(result.stderr.strip().split("\n")) == 1
+
+
+def test_a_run_without_the_stage_says_what_to_do(slamcli: Callable, here: Path, room: Path) -> None:
+    run = here / "run"
+    RunDir.create(run, dataset="room", root=str(room), digest="sha256:0")
+    for command in (("export-cloud", "a.ply"), ("export-octree", "a.bt"), ("render", "a.png")):
+        result = slamcli(*command, "-r", run)
+        assert result.exit_code == 1 and "slamcli run --until" in result.stderr
+
+
+def test_a_run_with_an_empty_map_can_be_exported_but_not_drawn(tmp_path: Path) -> None:
+    from slamcli.errors import SlamError
+    from slamcli.visualization import render
+
+    empty = prune(OccupancyMap(0.05, hit=0.7, miss=0.4, clamp_min=0.1, clamp_max=0.9).leaves())
+    octomap.write_bt(tmp_path / "map.bt", empty)
+    with pytest.raises(SlamError, match="nothing to draw"):
+        render.draw_octree(octomap.read(tmp_path / "map.bt"), view=render.View())

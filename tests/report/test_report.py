@@ -1,0 +1,193 @@
+"""The page holds what the run holds, needs nothing else, and lets no text from outside become markup."""
+
+import dataclasses
+import json
+import re
+import shutil
+import subprocess
+from collections.abc import Callable
+from html.parser import HTMLParser
+from pathlib import Path
+
+import finished
+import numpy as np
+import pytest
+from click.testing import Result
+
+from slamcli.evaluation.run_content import collect
+from slamcli.report import doubts, make, pictures
+from slamcli.runs.run_directory import RunDir
+from slamcli.schema import Grid
+
+Command = Callable[..., Result]
+LARGEST = 15e6  # bytes
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+VOID = {"meta", "link", "img", "br", "hr", "input"}
+
+
+class Page(HTMLParser):
+    """Check that tags nest; collect what the page would load and the data it draws."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.loads: list[str] = []
+        self.images = 0
+        self.text = ""
+        self.feed(text)
+        self.close()
+        assert not self.open, f"not closed: {self.open}"
+        self.data = json.loads(re.search(r'<script id="data" type="application/json">(.*?)</script>', text, re.S).group(1))
+
+    def handle_starttag(self, tag: str, attrs: list) -> None:
+        self.loads += [value for name, value in attrs if name in ("src", "href", "srcset", "data", "action")]
+        self.images += tag == "img"
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        if self.open and self.open[-1] not in ("script", "style"):
+            self.text += data
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> finished.Finished:
+    return finished.make(tmp_path_factory.mktemp("finished"))
+
+
+def page_of(slamcli: Command, run: Path, out: Path) -> Page:
+    result = slamcli("report", "-r", run, "-o", out)
+    assert result.exit_code == 0, result.stderr
+    assert result.stdout.strip() == str(out)
+    text = out.read_text()
+    assert len(text) < LARGEST
+    assert "http:" not in text
+    assert "https:" not in text
+    page = Page(text)
+    assert all(value.startswith("data:") for value in page.loads)
+    return page
+
+
+def test_page_of_a_run(slamcli: Command, made: finished.Finished, tmp_path: Path) -> None:
+    page = page_of(slamcli, made.run, tmp_path / "report.html")
+    assert [len(page.data[key]) for key in ("time", "state", "inliers", "features", "error")] == [90] * 5
+    assert [i for i, x in enumerate(page.data["position"][0]) if x is None] == np.flatnonzero(made.lost).tolist()
+    assert [i for i, e in enumerate(page.data["error"]) if e is None] == np.flatnonzero(made.lost).tolist()
+    assert page.data["loops"] == [[80, 0]] or len(page.data["loops"]) == 1
+    assert "84 of 90 frames located" in page.text
+    assert "6 of 90 frames are lost" in page.text
+    assert "The floor was found" in page.text
+    for stage in ("track", "optimize", "loop"):
+        assert stage in page.text
+    assert "grid2d has not been run" in page.text
+
+
+def test_truth_lies_on_the_estimate(slamcli: Command, made: finished.Finished, tmp_path: Path) -> None:
+    page = page_of(slamcli, made.run, tmp_path / "report.html")
+    truth, position = np.array(page.data["truth"]).T, np.array(page.data["position"], dtype=float).T
+    nearest = np.linalg.norm(position[~made.lost][:, None] - truth[None], axis=2).min(axis=1)
+    assert 0.0 < np.sqrt((nearest**2).mean()) < 0.01
+
+
+def test_page_goes_to_the_run_by_default(slamcli: Command, tmp_path: Path) -> None:
+    made = finished.make(tmp_path, frames=30, n_lost=0)
+    assert slamcli("report", "-r", made.run).exit_code == 0
+    assert (made.run / "report.html").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize("until", ["track", "optimize", "loop"])
+def test_unfinished_run(slamcli: Command, tmp_path: Path, until: str) -> None:
+    made = finished.make(tmp_path, until=until, frames=30, n_lost=0)
+    page = page_of(slamcli, made.run, tmp_path / "report.html")
+    assert "All 30 frames have a pose" in page.text
+    assert "densify has not been run" in page.text
+
+
+def test_nothing_tracked_yet(slamcli: Command, tmp_path: Path) -> None:
+    made = finished.make(tmp_path, until="match", frames=30, n_lost=0)
+    result = slamcli("report", "-r", made.run)
+    assert result.exit_code == 1
+    assert "slamcli run --until track" in result.stderr
+
+
+def test_without_ground_truth_and_without_the_recording(slamcli: Command, tmp_path: Path) -> None:
+    made = finished.make(tmp_path, with_truth=False, frames=30, n_lost=0)
+    page = page_of(slamcli, made.run, tmp_path / "report.html")
+    assert page.data["error"] == []
+    assert "has no ground truth" in page.text
+    shutil.rmtree(made.recording)
+    page = page_of(slamcli, made.run, tmp_path / "report.html")
+    assert "the recording is not there any more" in page.text
+
+
+def test_text_from_outside_stays_text(slamcli: Command, tmp_path: Path) -> None:
+    evil = "</script><script>document.title='hit'</script><img src=x onerror=alert(1)>"
+    made = finished.make(tmp_path, frames=30, n_lost=0)
+    info = json.loads((made.run / "run.json").read_text())
+    (made.run / "run.json").write_text(json.dumps({**info, "dataset": evil}))
+    record = json.loads((made.run / "track" / "stage.json").read_text())
+    (made.run / "track" / "stage.json").write_text(json.dumps({**record, "warnings": [evil], "summary": {"frames": 30, evil: evil}}))
+    page = page_of(slamcli, made.run, tmp_path / "report.html")
+    assert page.images == 2  # the cloud, and a frame with its features
+    assert page.text.count("onerror=alert(1)") >= 3
+
+
+def test_remarks_are_sorted_by_gravity_and_name_what_is_wrong(made: finished.Finished) -> None:
+    content = collect(RunDir.find(str(made.run)))
+    kinds = [remark.kind for remark in doubts.remarks(content)]
+    assert kinds == sorted(kinds, key=(doubts.BAD, doubts.NOTE, doubts.GOOD).index)
+    texts = " ".join(remark.text for remark in doubts.remarks(content))
+    assert "fewer than 150 features" in texts  # the fake run has none at all
+
+
+def test_frames_of_other_map_segments_are_told_of(made: finished.Finished) -> None:
+    content = collect(RunDir.find(str(made.run)))
+    T_lc = content.T_lc.copy()
+    T_lc[-7:] = np.nan  # not lost, but in a frame of their own
+    texts = " ".join(remark.text for remark in doubts.remarks(dataclasses.replace(content, T_lc=T_lc)))
+    assert f"7 of {len(T_lc)} frames belong to map segments that could not be joined" in texts
+    assert "belong to map segments" not in " ".join(remark.text for remark in doubts.remarks(content))
+
+
+def test_example_route_stays_in_the_largest_free_region() -> None:
+    state = np.full((60, 80), 1, np.int8)
+    state[5:55, 5:60] = 0
+    state[5:15, 65:75] = 0  # nearer to the camera, but too small
+    grid = Grid(
+        p_occupied=np.zeros((60, 80), np.float32),
+        n_seen=np.ones((60, 80), np.int32),
+        state=state,
+        origin=np.zeros(2),
+        resolution=np.array(0.05),
+    )
+    route = pictures.example_route(grid, np.array([[3.5, 0.5, 0.0]]))
+    assert route.xy[:, 0].max() < 3.0
+    assert route.length > 2.0
+    blocked = Grid(grid.p_occupied, grid.n_seen, np.ones_like(state), grid.origin, grid.resolution)
+    assert pictures.example_route(blocked, np.array([[3.5, 0.5, 0.0]])) is None
+
+
+def test_page_with_maps(room_run: Path, tmp_path: Path) -> None:
+    make(RunDir.find(str(room_run)), tmp_path / "report.html")
+    text = (tmp_path / "report.html").read_text()
+    page = Page(text)
+    assert page.images == 4
+    assert "Not drawn" not in page.text
+    assert len(text) < LARGEST
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="needs chromium")
+def test_page_runs_in_a_browser_without_complaint(slamcli: Command, made: finished.Finished, tmp_path: Path) -> None:
+    page_of(slamcli, made.run, tmp_path / "report.html")
+    done = "<script>console.log('charts ' + document.querySelectorAll('#charts canvas').length)</script></body>"
+    text = (tmp_path / "report.html").read_text().replace("</body>", done)
+    (tmp_path / "report.html").write_text(text)
+    flags = ["--headless", "--no-sandbox", "--disable-gpu", "--enable-logging=stderr", f"--user-data-dir={tmp_path / 'profile'}"]
+    command = [CHROMIUM, *flags, f"--screenshot={tmp_path / 'page.png'}", "--window-size=1300,1600", (tmp_path / "report.html").as_uri()]
+    said = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True).stderr
+    messages = [line for line in said.splitlines() if "CONSOLE" in line]
+    assert len(messages) == 1
+    assert "charts 3" in messages[0]

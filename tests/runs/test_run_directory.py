@@ -1,0 +1,253 @@
+"""The run directory: which one is meant, damage, locks, commits, and what it says when it is not what it should be."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import fakes
+import pytest
+
+from slamcli import files
+from slamcli.config.options import Config
+from slamcli.errors import SlamError
+from slamcli.runs import run_directory
+from slamcli.runs.pipeline import Pipeline
+from slamcli.runs.run_directory import RunDir
+from slamcli.schema import FORMAT
+from slamcli.stages import NAMES, STAGES
+
+
+@pytest.fixture
+def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> RunDir:
+    """A finished run of fake stages."""
+    for stage in STAGES:
+        monkeypatch.setitem(sys.modules, f"slamcli.stages.{stage.name}", fakes.module(stage))
+    (tmp_path / "recording").mkdir()
+    pipeline = fakes.make_run(tmp_path / "runs" / "fake", tmp_path / "recording")
+    pipeline.bring_up_to_date()
+    monkeypatch.chdir(tmp_path)
+    return pipeline.run
+
+
+def create(path: Path, root: str = "/recording", digest: str = "sha256:1") -> RunDir:
+    return RunDir.create(path, dataset="fake", root=root, digest=digest)
+
+
+# which run
+
+
+def test_the_named_run_goes_before_the_environment_and_that_before_the_latest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("a", "b", "c"):
+        create(Path("runs") / name)
+    RunDir(Path("runs/c")).mark_latest()
+    assert RunDir.find(None).path == Path("runs/c")
+    monkeypatch.setenv("SLAMCLI_RUN", "runs/b")
+    assert RunDir.find(None).path == Path("runs/b")
+    assert RunDir.find("runs/a").path == Path("runs/a")
+
+
+def test_latest_follows_a_run_kept_elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "work").mkdir()
+    monkeypatch.chdir(tmp_path / "work")
+    create(tmp_path / "far" / "away").mark_latest()
+    assert RunDir.find(None).path.resolve() == (tmp_path / "far" / "away").resolve()
+    create(Path("runs") / "near").mark_latest()
+    assert os.readlink("runs/latest") == "near"
+    assert sorted(os.listdir("runs")) == ["latest", "near"]
+
+
+def test_no_latest_where_the_current_folder_cannot_be_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = create(tmp_path / "far")
+    monkeypatch.chdir(tmp_path)
+    Path("runs").write_text("a file, not a folder")
+    run.mark_latest()
+
+
+def test_no_run_and_no_such_run_say_what_to_do(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SlamError, match="make one with: slamcli run demo"):
+        RunDir.find(None)
+    with pytest.raises(SlamError, match="runs/x: not a run directory"):
+        RunDir.find("runs/x")
+
+
+@pytest.mark.parametrize("name", ["", "..", "../x", "/etc", "latest", "a/../../b"])
+def test_no_recording_name_leads_out_of_runs(name: str) -> None:
+    with pytest.raises(SlamError, match="name one with -r"):
+        run_directory.default_path(name)
+
+
+def test_a_run_belongs_to_one_recording_which_may_move_or_change(tmp_path: Path) -> None:
+    path = tmp_path / "run"
+    create(path, "/old", "sha256:1")
+    assert create(path, "/new", "sha256:1").info()["root"] == "/new"
+    assert create(path, "/new", "sha256:2").info()["digest"] == "sha256:2"
+    with pytest.raises(SlamError, match=r"holds a run of another recording \(/new\); name another folder with -r"):
+        create(path, "/other", "sha256:3")
+
+
+def test_a_folder_of_something_else_is_never_taken_over(tmp_path: Path) -> None:
+    (tmp_path / "thesis.txt").write_text("years of work")
+    with pytest.raises(SlamError, match="not empty and not a run directory"):
+        create(tmp_path)
+    assert os.listdir(tmp_path) == ["thesis.txt"]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (f'{{"format": {FORMAT + 1}}}', f"a run of format {FORMAT + 1}, this slamcli reads {FORMAT}"),
+        (f'{{"format": {FORMAT}}}', "dataset, root or digest is missing"),
+        ("{", "not valid JSON"),
+        ("", "not valid JSON"),
+        ("[" * 100_000, "not valid JSON"),
+        ("[]", "not a JSON object"),
+    ],
+)
+def test_a_run_of_another_version_or_a_broken_one_is_refused(tmp_path: Path, text: str, message: str) -> None:
+    (tmp_path / "run.json").write_text(text)
+    with pytest.raises(SlamError) as caught:
+        RunDir.find(str(tmp_path))
+    assert message in str(caught.value)
+
+
+# what a stage left
+
+
+def state(run: RunDir, stage: str, *, verify: bool = False) -> tuple[str, str]:
+    found = run.states(verify=verify)[stage]
+    return found.state, found.reason
+
+
+def test_a_short_file_is_damage_and_so_is_an_absent_one(run: RunDir) -> None:
+    out = run.path / "loop" / "out.txt"
+    out.write_text("")
+    assert state(run, "loop") == ("damaged", "loop/out.txt has 0 bytes, 64 recorded")
+    assert state(run, "densify") == ("stale", "input: loop is damaged")
+    out.unlink()
+    assert state(run, "loop") == ("damaged", "loop/out.txt is not there")
+
+
+def test_other_content_of_the_same_size_is_found_by_verify(run: RunDir) -> None:
+    (run.path / "loop" / "out.txt").write_text("x" * 64)
+    assert state(run, "loop") == ("up to date", "")
+    assert state(run, "loop", verify=True) == ("damaged", "loop/out.txt has other content than recorded")
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("", "loop/stage.json: not valid JSON"),
+        ("{}", "loop/stage.json: not a stage's record"),
+        (json.dumps({"format": FORMAT, "outputs": {"a": 1}}), "loop/stage.json: not a stage's record"),
+        (None, "loop/stage.json: not there"),
+    ],
+)
+def test_a_broken_record_is_damage(run: RunDir, text: str | None, reason: str) -> None:
+    path = run.path / "loop" / "stage.json"
+    path.unlink() if text is None else path.write_text(text)
+    assert state(run, "loop") == ("damaged", reason)
+
+
+@pytest.mark.parametrize("entry", [{}, {"bytes": "64", "sha256": ""}, 3])
+def test_a_hostile_record_is_damage_and_no_traceback(run: RunDir, entry: object) -> None:
+    record = run.record("loop")
+    (run.path / "loop" / "stage.json").write_text(json.dumps({**record, "outputs": {"../../../etc/passwd": entry}}))
+    assert state(run, "loop")[0] == "damaged"
+
+
+def test_damage_is_mended_by_running_again(run: RunDir) -> None:
+    before = fakes.digests(run)
+    (run.path / "loop" / "out.txt").write_text("")
+    (run.path / "match" / "stage.json").write_text("{")
+    pipeline = Pipeline(run, run.config(), dataset=fakes.FakeDataset(Path(run.info()["root"])))
+    pipeline.bring_up_to_date()
+    assert all(found.is_fresh for found in run.states(verify=True).values())
+    assert fakes.digests(run) == before
+
+
+def test_a_result_of_another_version_is_stale(run: RunDir) -> None:
+    record = run.record("track")
+    for change, reason in (
+        ({"environment": {**record["environment"], "slamcli": "0.0.1"}}, "code: slamcli 0.0.1 -> "),
+        ({"format": FORMAT - 1}, f"code: format {FORMAT - 1} -> {FORMAT}"),
+    ):
+        (run.path / "track" / "stage.json").write_text(json.dumps({**record, **change}))
+        assert state(run, "track")[0] == "stale"
+        assert state(run, "track")[1].startswith(reason)
+
+
+def test_a_missing_stage_is_named_with_the_command_that_makes_it(run: RunDir, caplog: pytest.LogCaptureFixture) -> None:
+    assert run.stage_path("loop", "out.txt").read_text()
+    assert not caplog.text
+    with pytest.raises(SlamError, match=r"loop/cloud.ply: not there; make it with: slamcli loop"):
+        run.stage_path("loop", "cloud.ply")
+    (run.path / "loop" / "out.txt").unlink()
+    (run.path / "loop" / "stage.json").unlink()
+    with pytest.raises(SlamError, match="loop has not been run; try: slamcli run --until loop"):
+        run.stage_path("loop")
+
+
+def test_reading_a_stale_result_warns_once(run: RunDir, caplog: pytest.LogCaptureFixture) -> None:
+    text = (run.path / "config.toml").read_text()
+    (run.path / "config.toml").write_text(text.replace("seed = 0", "seed = 1"))
+    run.stage_path("loop")
+    run.stage_path("loop")
+    assert caplog.text.count("loop is stale (config: seed 0 -> 1); bring it up to date with: slamcli run") == 1
+
+
+# writing
+
+
+def test_a_second_writer_is_refused_and_told_who_the_first_is(run: RunDir) -> None:
+    with run.lock():
+        with pytest.raises(SlamError, match=f"in use by another slamcli \\(process {os.getpid()}\\)"), RunDir(run.path).lock():
+            pass
+        code = f"from slamcli.runs.run_directory import RunDir; from pathlib import Path\nwith RunDir(Path({str(run.path)!r})).lock(): pass"
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+        assert "in use by another slamcli" in done.stderr
+    with RunDir(run.path).lock():
+        pass
+
+
+def test_readers_need_no_lock_and_no_permission_to_write(run: RunDir) -> None:
+    with run.lock():
+        assert set(run.states()) == set(NAMES)
+        assert run.config() == Config()
+
+
+def test_leftovers_of_the_dead_are_cleared_once_the_lock_is_held(run: RunDir) -> None:
+    for leftover in (".track.4711", ".track.old"):
+        (run.path / leftover).mkdir()
+        (run.path / leftover / "half").write_text("x")
+    before = fakes.digests(run)
+    with run.lock():
+        pass
+    assert not list(run.path.glob(".track.*"))
+    assert fakes.digests(run) == before
+
+
+def test_outputs_lists_every_file_by_name_in_order(tmp_path: Path) -> None:
+    (tmp_path / "sub").mkdir()
+    for name in ("b.txt", "a.txt", "sub/c.txt"):
+        (tmp_path / name).write_text(name)
+    found = run_directory.outputs(tmp_path)
+    assert list(found) == ["a.txt", "b.txt", "sub/c.txt"]
+    assert found["sub/c.txt"]["bytes"] == 9
+
+
+def test_small_files_are_replaced_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "config.toml"
+    files.write_text(path, "old")
+
+    def fail(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "replace", fail)
+    with pytest.raises(OSError, match="No space"):
+        files.write_text(path, "new")
+    assert path.read_text() == "old"
+    assert os.listdir(tmp_path) == ["config.toml"]
