@@ -18,7 +18,8 @@ from slamcli.runs.run_directory import RunDir
 from slamcli.schema import LOST, CoarseDepth, Features, Map, Matches, Timing, Tracks, Trajectory, Words, trajectory
 from slamcli.slam import final_refinement
 from slamcli.slam.depth_tracking import Reliefs
-from slamcli.slam.localizer import Localiser
+from slamcli.slam.localizer import Localizer
+from slamcli.slam.place_recognition import PlaceIndex
 from slamcli.sparse_map.sparse_map import MapBuilder
 
 LOOKS = 2  # at all frames with hindsight: the motion that rectifies them comes from the look before
@@ -67,9 +68,9 @@ def _find(run: RunDir, new: RunDir, config: Config, progress: Progress) -> Local
         features = self_calibration.recalibrate(features, given, camera)
     else:
         camera = new.camera()
-    localiser = Localiser(
+    localizer = Localizer(
         builder,
-        run.load(Words, "match"),
+        PlaceIndex(run.load(Words, "match"), builder.kf.frame),
         features,
         new.load(Words, "match"),
         new.load(Matches, "match"),
@@ -81,8 +82,8 @@ def _find(run: RunDir, new: RunDir, config: Config, progress: Progress) -> Local
         map_reliefs=Reliefs(run.load(CoarseDepth, "extract"), given, config.sensor).under(run.camera("loop")),
     )
     for i in progress(range(len(features.stamp)), "localize"):
-        localiser.process(i)
-    tracks = localiser.tracks()
+        localizer.process(i)
+    tracks = localizer.tracks()
     if (tracks.state == LOST).all():
         raise SlamError(f"{new.info()['root']}: no frame was recognised in the map of {run.path}; do both show the same place?")
     tracks = _refine(builder, features, tracks, when, map_, camera, config, progress)

@@ -1,7 +1,6 @@
 """Frames and key frames placed by the shape that their depth images show, where texture ends."""
 
 from collections import OrderedDict
-from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -68,6 +67,9 @@ class NoReliefs(Reliefs):
         return self
 
 
+NO_RELIEFS = NoReliefs()
+
+
 @dataclass(frozen=True)
 class Placement:
     """Where a frame stands by shape, and the evidence."""
@@ -116,27 +118,9 @@ class Shape:
                 break
         return placement
 
-    def find(
-        self, frame: int, kfs: Iterable[int], starts: list[np.ndarray], landmarks: Callable[[Placement], tuple | None]
-    ) -> Placement | None:
-        """Align a frame with one key frame after the other, until one determines its pose; else give the best placement.
-
-        landmarks : gives, first, the pose estimate of the landmarks found around a placement, None where there are too few
-        """
-        if self._reliefs.of(frame) is None:
-            return None
-        best = None
-        for kf in kfs:
-            placed = self.place(frame, kf, starts)
-            if placed is not None and placed.is_sound and placed.n_determined < 6:
-                few = landmarks(placed)
-                if few is not None:
-                    placed = self.place(frame, kf, [placed.T_cw], (few[0].T_cw, few[0].information))
-            if placed is not None and placed.is_sound and (best is None or placed.n_determined > best.n_determined):
-                best = placed
-            if best is not None and best.n_determined == 6:
-                break
-        return best
+    def has_depth(self, frame: int) -> bool:
+        """Say whether a frame's depth image shows enough to be aligned."""
+        return self._reliefs.of(frame) is not None
 
     def fixes_all(self, frame: int) -> bool:
         """Say whether the shape that a frame shows determines all directions of motion, so that a map can begin with it."""

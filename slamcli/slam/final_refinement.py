@@ -12,8 +12,8 @@ from slamcli.geometry import se3
 from slamcli.geometry.camera import Camera
 from slamcli.schema import KEY_FRAME, LOST, ON_SHAPE, RELOCALISED, Features, Tracks
 from slamcli.slam.depth_tracking import Reliefs, Shape
-from slamcli.slam.localizer import estimate_pose, frame_features
 from slamcli.sparse_map import guided_matching, map_adjustment
+from slamcli.sparse_map.frame import frame_features, refine_on_landmarks
 from slamcli.sparse_map.sparse_map import MapBuilder
 
 SHARED = 30  # landmarks of two key frames whose depth images are aligned too
@@ -130,7 +130,7 @@ class _Look:
         which = np.flatnonzero(feature >= 0)
         if len(which) < wanted:
             return False
-        estimate = estimate_pose(se3.inverse(T_wc), candidates.xyz[which], frame, feature[which], self.camera)
+        estimate = refine_on_landmarks(se3.inverse(T_wc), candidates.xyz[which], frame, feature[which], self.camera)
         if estimate.n_inliers < wanted:
             return False
         self.ref_kf[i], self.n_inliers[i] = kf, estimate.n_inliers

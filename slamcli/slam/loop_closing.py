@@ -9,11 +9,12 @@ from slamcli.estimation import camera_pose, pose_graph
 from slamcli.geometry import se3
 from slamcli.geometry.camera import Camera
 from slamcli.schema import Words
-from slamcli.slam.localizer import estimate_pose, frame_features, word_vector
-from slamcli.slam.tracker import share_landmarks
+from slamcli.slam.place_recognition import PlaceIndex
 from slamcli.sparse_map import guided_matching, map_adjustment
+from slamcli.sparse_map.frame import frame_features, refine_on_landmarks
+from slamcli.sparse_map.landmark_fusion import fuse_landmarks
 from slamcli.sparse_map.sparse_map import MapBuilder
-from slamcli.vision import hamming, vocabulary
+from slamcli.vision import hamming
 
 # Between neighbours that share 100 landmarks [m, rad]. In simulated rooms the drift over 20 to 50 key frames is a fourth to an eighth of
 # what follows from it: a true closure must not be dropped where tracking was poor, and a false one is metres off.
@@ -43,30 +44,11 @@ class Candidate:
         return not self.reason
 
 
-class Recogniser:
-    """Word vectors of the key frames, and which of them look alike."""
-
-    def __init__(self, words: Words, kf_frame: np.ndarray):
-        self.words = words
-        self._index = vocabulary.InvertedIndex(len(words.idf))
-        self._vectors = []
-        for kf, frame in enumerate(kf_frame):
-            self._vectors.append(word_vector(words, int(frame)))
-            self._index.add(kf, *self._vectors[kf])
-
-    def scores(self, kf: int) -> np.ndarray:
-        """Give the similarity (K,) of key frame `kf` to every key frame; [Z] (10)."""
-        scores = np.zeros(len(self._vectors))
-        found, values = self._index.query(*self._vectors[kf])
-        scores[found] = values
-        return scores
-
-
-def find_candidates(builder: MapBuilder, recogniser: Recogniser, settings: LoopConfig) -> list[Candidate]:
+def find_candidates(builder: MapBuilder, places: PlaceIndex, settings: LoopConfig) -> list[Candidate]:
     """Give for each key frame the earlier ones that look like it and share (almost) no landmarks with it, most alike first."""
     candidates = []
     for i in range(len(builder.kf)):
-        scores = recogniser.scores(i)
+        scores = places.scores(i)
         shared = builder.votes(builder.landmarks_of(i))
         # Each vocabulary has its own range of scores: a place seen again should look as alike as the worst of the neighbours, [ORB-SLAM].
         neighbours = np.flatnonzero(shared >= settings.min_shared)
@@ -82,7 +64,7 @@ def find_candidates(builder: MapBuilder, recogniser: Recogniser, settings: LoopC
     return sorted(candidates, key=lambda c: (-c.score, c.kf_i, c.kf_j))
 
 
-def find_near(builder: MapBuilder, recogniser: Recogniser, settings: LoopConfig) -> list[Candidate]:
+def find_near(builder: MapBuilder, places: PlaceIndex, settings: LoopConfig) -> list[Candidate]:
     """Give for each key frame the earlier one that looks at the same spot by the poses of now, yet shares (almost) no landmarks with it, nearest first.
 
     Words miss such pairs when little of the two views is in common, as on either side of a gap, or when both are seen at an angle.
@@ -96,7 +78,7 @@ def find_near(builder: MapBuilder, recogniser: Recogniser, settings: LoopConfig)
         apart = np.where(is_open, np.linalg.norm(spot[:i] - spot[i], axis=1), np.inf)
         j = int(np.argmin(apart))
         if apart[j] < settings.near:
-            candidates.append((float(apart[j]), Candidate(i, j, float(recogniser.scores(i)[j]), is_near=True)))
+            candidates.append((float(apart[j]), Candidate(i, j, float(places.scores(i)[j]), is_near=True)))
     return [c for _, c in sorted(candidates, key=lambda pair: (pair[0], pair[1].kf_i))]
 
 
@@ -167,7 +149,7 @@ def _look_again(
         which = np.flatnonzero(feature >= 0)
         if len(which) < settings.min_inliers:
             return replace(candidate, n_inliers=len(which), reason=f"{len(which)} of {settings.min_inliers} landmarks found again")
-        estimate = estimate_pose(T_iw, landmarks.xyz[which], frame_i, feature[which], camera)
+        estimate = refine_on_landmarks(T_iw, landmarks.xyz[which], frame_i, feature[which], camera)
         T_iw = estimate.T_cw
     candidate = replace(candidate, n_inliers=estimate.n_inliers)
     if estimate.n_inliers < settings.min_inliers:
@@ -259,5 +241,5 @@ def fuse_around(builder: MapBuilder, closure: Candidate, camera: Camera, setting
     n = 0
     for here, there in (sides, sides[::-1]):
         for kf in here:
-            n += share_landmarks(builder, int(kf), builder.landmarks_in(there), camera, sensor, max_distance=settings.fuse_max_distance)
+            n += fuse_landmarks(builder, int(kf), builder.landmarks_in(there), camera, sensor, max_distance=settings.fuse_max_distance)
     return n

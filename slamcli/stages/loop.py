@@ -15,6 +15,7 @@ from slamcli.schema import LOST, Closures, CoarseDepth, Features, Map, Timing, T
 from slamcli.slam import final_refinement, loop_closing, map_segments
 from slamcli.slam.depth_tracking import Reliefs
 from slamcli.slam.loop_closing import Candidate
+from slamcli.slam.place_recognition import PlaceIndex
 from slamcli.sparse_map import map_adjustment
 from slamcli.sparse_map.sparse_map import MapBuilder
 from slamcli.stages.extract import write_camera
@@ -76,12 +77,12 @@ def main_first(map_: Map, tracks: Tracks, main: int) -> Map:
 
 def close_loops(builder: MapBuilder, words: Words, camera, cfg, tools) -> list[Candidate]:
     """Search, verify, correct, fuse, adjust; again while that brings new closures. Returns all candidates with their fate."""
-    recogniser = loop_closing.Recogniser(words, builder.kf.frame)
+    places = PlaceIndex(words, builder.kf.frame)
     rng = tools.rng()
-    fate = join_segments(builder, recogniser, camera, cfg, rng)
+    fate = join_segments(builder, places, camera, cfg, rng)
     for _ in range(cfg.loop.rounds):
         new = []
-        candidates = loop_closing.find_candidates(builder, recogniser, cfg.loop) + loop_closing.find_near(builder, recogniser, cfg.loop)
+        candidates = loop_closing.find_candidates(builder, places, cfg.loop) + loop_closing.find_near(builder, places, cfg.loop)
         for candidate in tools.progress(candidates, "loop"):
             pair = (candidate.kf_i, candidate.kf_j)
             if are_apart(builder, candidate):
@@ -121,12 +122,12 @@ def are_apart(builder: MapBuilder, c: Candidate) -> bool:
     return bool(builder.kf.segment[c.kf_i] != builder.kf.segment[c.kf_j])
 
 
-def join_segments(builder: MapBuilder, recogniser, camera, cfg, rng) -> dict[tuple[int, int], Candidate]:
+def join_segments(builder: MapBuilder, places, camera, cfg, rng) -> dict[tuple[int, int], Candidate]:
     """Join map segments that saw the same place. Returns the fate of candidates between segments, by pair of key frames."""
     if len(np.unique(builder.kf.segment)) < 2:
         return {}
-    between = [c for c in loop_closing.find_candidates(builder, recogniser, cfg.loop) if are_apart(builder, c)]
-    tried = [loop_closing.verify(builder, recogniser.words, c, camera, cfg.loop, cfg.sensor, rng) for c in between]
+    between = [c for c in loop_closing.find_candidates(builder, places, cfg.loop) if are_apart(builder, c)]
+    tried = [loop_closing.verify(builder, places.words, c, camera, cfg.loop, cfg.sensor, rng) for c in between]
     fate = [c for c in tried if not c.is_accepted]
     left = [c for c in tried if c.is_accepted]
     while found := map_segments.find_join(builder, left, least=cfg.loop.join_closures):

@@ -10,8 +10,7 @@ from slamcli.calibration import rolling_shutter, self_calibration
 from slamcli.calibration.self_calibration import Sensing
 from slamcli.schema import CoarseDepth, Features, Map, Timing, Tracks
 from slamcli.slam import final_refinement, map_segments
-from slamcli.slam.depth_tracking import Reliefs
-from slamcli.slam.localizer import NO_RELIEFS
+from slamcli.slam.depth_tracking import NO_RELIEFS, Reliefs
 from slamcli.sparse_map import map_adjustment
 from slamcli.sparse_map.sparse_map import MapBuilder
 from slamcli.stages.extract import write_camera

@@ -10,6 +10,7 @@ from slamcli.config.options import LoopConfig, SensorConfig, TrackConfig
 from slamcli.geometry import se3
 from slamcli.schema import LOST, frame_poses
 from slamcli.slam import final_refinement, loop_closing
+from slamcli.slam.place_recognition import PlaceIndex
 from slamcli.slam.tracker import Tracker
 from slamcli.sparse_map import map_adjustment
 from slamcli.sparse_map.sparse_map import MapBuilder
@@ -25,7 +26,7 @@ def turn():
     tracker = Tracker(scene.features, scene.words, scene.matches, CAMERA, TrackConfig(), SENSOR, np.random.default_rng(0))
     for i in range(150):
         tracker.process(i)
-    assert (tracker.state != LOST).all()
+    assert (tracker.tracks().state != LOST).all()
     return scene, tracker.tracks(), tracker.map()
 
 
@@ -41,16 +42,16 @@ def drifted(scene, map_, per_key_frame: np.ndarray) -> MapBuilder:
 
 
 def verified(scene, builder) -> list[loop_closing.Candidate]:
-    recogniser = loop_closing.Recogniser(scene.words, builder.kf.frame)
+    places = PlaceIndex(scene.words, builder.kf.frame)
     rng = np.random.default_rng(1)
-    candidates = loop_closing.find_candidates(builder, recogniser, SETTINGS)
+    candidates = loop_closing.find_candidates(builder, places, SETTINGS)
     return [loop_closing.verify(builder, scene.words, c, CAMERA, SETTINGS, SENSOR, rng) for c in candidates]
 
 
 def test_similarity_is_symmetric_and_one_for_itself(turn):
     scene, _, map_ = turn
-    recogniser = loop_closing.Recogniser(scene.words, map_.kf_frame)
-    scores = np.array([recogniser.scores(k) for k in range(len(map_.kf_frame))])
+    places = PlaceIndex(scene.words, map_.kf_frame)
+    scores = np.array([places.scores(k) for k in range(len(map_.kf_frame))])
     np.testing.assert_allclose(np.diag(scores), 1.0, atol=1e-5)
     np.testing.assert_allclose(scores, scores.T, atol=1e-6)
 
@@ -165,8 +166,8 @@ def test_views_of_one_spot_are_found_by_their_poses(turn):
     scene, _, map_ = turn
     true = scene.T_gc[map_.kf_frame]
     builder = drifted(scene, map_, np.array([0.001, 0.0, 0.0, 0.0, 0.0003, 0.0]))
-    recogniser = loop_closing.Recogniser(scene.words, builder.kf.frame)
-    near = loop_closing.find_near(builder, recogniser, SETTINGS)
+    places = PlaceIndex(scene.words, builder.kf.frame)
+    near = loop_closing.find_near(builder, places, SETTINGS)
     spot = builder.kf.T_wk[:, :3, 3] + loop_closing.AHEAD * builder.kf.T_wk[:, :3, 2]
     for c in near:
         assert c.is_near and c.kf_j < c.kf_i and np.linalg.norm(spot[c.kf_i] - spot[c.kf_j]) < SETTINGS.near
@@ -179,10 +180,10 @@ def test_views_of_one_spot_are_found_by_their_poses(turn):
         assert np.linalg.norm(error[:3]) < 0.05 and np.linalg.norm(error[3:]) < 0.02
     builder.kf.segment[len(true) // 2 :] = 1
     half = len(true) // 2
-    assert all((c.kf_i < half) == (c.kf_j < half) for c in loop_closing.find_near(builder, recogniser, SETTINGS))
+    assert all((c.kf_i < half) == (c.kf_j < half) for c in loop_closing.find_near(builder, places, SETTINGS))
 
 
 def test_no_spot_is_near_at_a_reach_of_zero(turn):
     scene, _, map_ = turn
     builder = MapBuilder.from_map(scene.features, map_)
-    assert loop_closing.find_near(builder, loop_closing.Recogniser(scene.words, builder.kf.frame), LoopConfig(near=0.0)) == []
+    assert loop_closing.find_near(builder, PlaceIndex(scene.words, builder.kf.frame), LoopConfig(near=0.0)) == []

@@ -1,0 +1,66 @@
+"""The poses of all frames as tracking finds them, each relative to its reference key frame, and the motion model."""
+
+import numpy as np
+
+from slamcli.geometry import se3
+from slamcli.schema import KEY_FRAME, LOST, Tracks
+from slamcli.sparse_map.sparse_map import MapBuilder
+
+STEADY_REACH = 4.0  # times the last step in time over which the motion is taken to go on: a gap says nothing about the motion within it
+
+
+class FramePoses:
+    """Each frame's pose relative to a reference key frame: when the map moves, the frame moves along.
+
+    latest : the last frame with a pose; anchored : the last one of which every direction of motion was measured (-1 before the first)
+    """
+
+    def __init__(self, builder: MapBuilder, stamp: np.ndarray) -> None:
+        """Begin with every frame lost; stamp : (F,) [s]."""
+        n = len(stamp)
+        self._kf = builder.kf
+        self.stamp = stamp
+        self.ref_kf = np.full(n, -1, dtype=np.int32)
+        self.T_kc = np.full((n, 4, 4), np.nan)
+        self.state = np.full(n, LOST, dtype=np.uint8)
+        self.n_inliers = np.zeros(n, dtype=np.int32)
+        self.lost_reason: dict[int, str] = {}
+        self.latest = self.anchored = -1
+
+    def tracks(self) -> Tracks:
+        """Return the poses of all frames as an artefact."""
+        return Tracks(ref_kf=self.ref_kf, T_kc=self.T_kc, state=self.state, n_inliers=self.n_inliers)
+
+    def has_pose(self, i: int) -> bool:
+        """Say whether there is a frame `i` that is not lost."""
+        return i >= 0 and self.ref_kf[i] >= 0
+
+    def T_wc(self, i: int) -> np.ndarray:
+        """Compute the pose (4, 4) of a frame that is not lost, under the map as it is now."""
+        return self._kf.T_wk[self.ref_kf[i]] @ self.T_kc[i]
+
+    def segment(self, i: int) -> int:
+        """Look up the map segment that a frame has its pose in, -1 if it is lost."""
+        return -1 if self.ref_kf[i] < 0 else int(self._kf.segment[self.ref_kf[i]])
+
+    def attach(self, i: int, kf: int, T_cw: np.ndarray, *, state: int, n_inliers: int, is_anchored: bool = True) -> None:
+        """Record the pose of frame `i`, to propagate with key frame `kf`."""
+        self.ref_kf[i], self.state[i], self.n_inliers[i], self.latest = kf, state, n_inliers, i
+        self.T_kc[i] = se3.inverse(T_cw @ self._kf.T_wk[kf])
+        self.anchored = i if is_anchored else self.anchored
+        self.lost_reason.pop(i, None)
+
+    def make_key_frame(self, i: int, kf: int) -> None:
+        """Record that frame `i` is key frame `kf` itself."""
+        self.ref_kf[i], self.T_kc[i], self.state[i], self.latest, self.anchored = kf, np.eye(4), KEY_FRAME, i, i
+
+    def predict(self, i: int, p: int, *, reach: float = STEADY_REACH) -> np.ndarray:
+        """Predict T_cw of frame `i`, assuming that the motion from the frame before `p` to frame `p` goes on at the same speed.
+
+        reach : times the time between those two, beyond which the camera is taken to rest where frame `p` saw it
+        """
+        T_wp = self.T_wc(p)
+        if not self.has_pose(p - 1) or self.segment(p - 1) != self.segment(p):
+            return se3.inverse(T_wp)
+        share = (self.stamp[i] - self.stamp[p - 1]) / (self.stamp[p] - self.stamp[p - 1])
+        return se3.inverse(se3.interpolate(self.T_wc(p - 1), T_wp, share if share < reach else 1.0))

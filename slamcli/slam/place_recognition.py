@@ -1,0 +1,41 @@
+"""Place recognition: which key frames look like an image, by the similarity of their bags of words; [Z] (10)."""
+
+import numpy as np
+
+from slamcli.schema import Words
+from slamcli.vision import vocabulary
+
+
+def bow_vector(words: Words, frame: int) -> tuple[np.ndarray, np.ndarray]:
+    """Look up the bag-of-words vector of one frame: words (B,) and their weights (B,)."""
+    span = slice(int(words.bow_offset[frame]), int(words.bow_offset[frame + 1]))
+    return np.array(words.bow_word[span]), np.array(words.bow_weight[span])
+
+
+class PlaceIndex:
+    """An inverted index over the bags of words of key frames."""
+
+    def __init__(self, words: Words, kf_frame: np.ndarray) -> None:
+        """Index the key frames whose frames are `kf_frame` (K,); `words` are of the recording that they belong to."""
+        self.words = words
+        self._index = vocabulary.InvertedIndex(len(words.idf))
+        self._vectors: list[tuple[np.ndarray, np.ndarray]] = []
+        for frame in kf_frame:
+            self.add(int(frame))
+
+    def add(self, frame: int) -> None:
+        """Add the next key frame, which is frame `frame` of the recording."""
+        vector = bow_vector(self.words, frame)
+        self._index.add(len(self._vectors), *vector)
+        self._vectors.append(vector)
+
+    def query(self, vector: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        """Find the key frames that share words with a bag-of-words vector, and the similarity of each."""
+        return self._index.query(*vector)
+
+    def scores(self, kf: int) -> np.ndarray:
+        """Compute the similarity (K,) of key frame `kf` to every key frame."""
+        scores = np.zeros(len(self._vectors))
+        found, values = self.query(self._vectors[kf])
+        scores[found] = values
+        return scores

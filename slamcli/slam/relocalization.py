@@ -1,0 +1,64 @@
+"""Relocalization: a frame without a predecessor is recognized by its words and placed in a key frame that looks like it; [Z] (10)."""
+
+import numpy as np
+
+from slamcli.config.options import TrackConfig
+from slamcli.estimation import camera_pose
+from slamcli.geometry.camera import Camera
+from slamcli.schema import Words
+from slamcli.slam.place_recognition import PlaceIndex, bow_vector
+from slamcli.sparse_map.frame import refine_on_landmarks
+from slamcli.sparse_map.guided_matching import FrameFeatures
+from slamcli.sparse_map.sparse_map import MapBuilder
+from slamcli.vision import hamming
+
+MORE_ROUNDS = 3  # times the rounds of RANSAC between neighbouring frames: fewer of the matches are true
+
+
+class Relocalizer:
+    """Finds frames in the map by their bags of words."""
+
+    def __init__(
+        self, builder: MapBuilder, places: PlaceIndex, words: Words, camera: Camera, settings: TrackConfig, rng: np.random.Generator
+    ) -> None:
+        """Take the map with the index of its key frames, and the words of the recording whose frames are looked for."""
+        self._builder, self._places, self._words = builder, places, words
+        self._camera, self._settings, self._rng = camera, settings, rng
+
+    def find(self, i: int, frame: FrameFeatures) -> tuple[np.ndarray, np.ndarray] | None:
+        """Find T_cw (4, 4) of frame `i` and the landmarks (N,) that it shows in the likest key frame that agrees; None in none."""
+        kfs, scores = self._places.query(bow_vector(self._words, i))
+        for kf in kfs[np.argsort(-scores, kind="stable")[: self._settings.relocalise_candidates]]:
+            row, ids = self._match_key_frame(int(kf), frame)
+            if len(row) < self._settings.min_inliers:
+                continue
+            x_w = self._builder.lm.xyz[ids]
+            start = camera_pose.ransac_p3p(
+                x_w,
+                frame.xy[row],
+                self._camera,
+                rng=self._rng,
+                rounds=MORE_ROUNDS * self._settings.ransac_rounds,
+                threshold_px=self._settings.ransac_threshold_px,
+            )
+            if start is None:
+                continue
+            estimate = refine_on_landmarks(start.T_cw, x_w, frame, row, self._camera)
+            if estimate.n_inliers >= self._settings.min_inliers:
+                return estimate.T_cw, ids[estimate.is_inlier]
+        return None
+
+    def _match_key_frame(self, kf: int, frame: FrameFeatures) -> tuple[np.ndarray, np.ndarray]:
+        """Match the frame with the landmarks of a key frame under the same vocabulary nodes; returns its features and the landmarks."""
+        there = self._builder.rows_of(kf)
+        here = slice(frame.first_row, frame.first_row + len(frame))
+        match, _ = hamming.match_nodes(
+            frame.desc.view(np.uint8),
+            self._words.node[here],
+            self._builder.features.desc[there],
+            self._places.words.node[there],
+            frame.angle,
+            self._builder.features.angle[there],
+        )
+        ids = self._builder.lm_of_row[there][match[:, 1]]
+        return match[ids >= 0, 0], ids[ids >= 0]

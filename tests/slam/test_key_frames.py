@@ -1,0 +1,80 @@
+"""The key-frame rule, clause by clause."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from slamcli.config.options import TrackConfig
+from slamcli.geometry import se3
+from slamcli.slam.key_frames import (
+    CROWD_M,
+    FEW_NEAR_LANDMARKS,
+    MANY_NEAR_FEATURES,
+    MOVED_M,
+    TURNED_RAD,
+    View,
+    count_crowd,
+    wants_key_frame,
+    wants_key_frame_by_depth,
+)
+
+SETTINGS = TrackConfig(min_inliers=15, key_frame_share=0.75, key_frame_gap=30, key_frame_crowd=4)
+CALM = View(n_landmarks=400, n_near_landmarks=300, n_near_new=200, n_reference=420, frames_since=3, n_crowd=0)  # nothing asks for one
+
+
+def test_a_frame_that_sees_its_reference_well_is_none():
+    assert not wants_key_frame(CALM, SETTINGS)
+
+
+@pytest.mark.parametrize(("n_landmarks", "expected"), [(315, False), (314, True)])  # three quarters of 420
+def test_leaving_the_reference_asks_for_one_exactly_below_its_share(n_landmarks: int, expected: bool):
+    assert wants_key_frame(replace(CALM, n_landmarks=n_landmarks), SETTINGS) == expected
+
+
+@pytest.mark.parametrize(("frames_since", "expected"), [(29, False), (30, True)])
+def test_a_long_time_asks_for_one(frames_since: int, expected: bool):
+    assert wants_key_frame(replace(CALM, frames_since=frames_since), SETTINGS) == expected
+
+
+@pytest.mark.parametrize("asks", [{"n_landmarks": 100}, {"frames_since": 99}])
+def test_where_enough_stand_already_neither_counts(asks: dict):
+    assert wants_key_frame(replace(CALM, n_crowd=3, **asks), SETTINGS)
+    assert not wants_key_frame(replace(CALM, n_crowd=4, **asks), SETTINGS)
+
+
+@pytest.mark.parametrize("n_crowd", [0, 99])
+def test_much_new_surface_asks_for_one_whoever_stands_there(n_crowd: int):
+    new = replace(CALM, n_near_landmarks=FEW_NEAR_LANDMARKS - 1, n_near_new=MANY_NEAR_FEATURES + 1, n_crowd=n_crowd)
+    assert wants_key_frame(new, SETTINGS)
+    assert not wants_key_frame(replace(new, n_near_landmarks=FEW_NEAR_LANDMARKS), SETTINGS)
+    assert not wants_key_frame(replace(new, n_near_new=MANY_NEAR_FEATURES), SETTINGS)
+
+
+def test_without_depth_there_is_nothing_to_make_landmarks_of():
+    blind = replace(CALM, n_landmarks=10, frames_since=99, n_near_landmarks=4, n_near_new=10)
+    assert not wants_key_frame(blind, SETTINGS)
+    assert wants_key_frame(replace(blind, n_near_new=11), SETTINGS)
+
+
+@pytest.mark.parametrize(
+    ("twist", "overlap", "expected"),
+    [
+        ([0, 0, 0.9 * MOVED_M, 0, 0.9 * TURNED_RAD, 0], 0.8, False),
+        ([0, 0, 1.1 * MOVED_M, 0, 0, 0], 0.8, True),
+        ([0, 0, 0, 0, 1.1 * TURNED_RAD, 0], 0.8, True),
+        ([0, 0, 0, 0, 0, 0], 0.74, True),
+    ],
+)
+def test_on_depth_the_way_from_the_reference_and_what_is_left_of_it_decide(twist: list, overlap: float, expected: bool):
+    assert wants_key_frame_by_depth(se3.exp(np.array(twist, dtype=float)), overlap, SETTINGS) == expected
+
+
+def test_a_crowd_stands_near_and_looks_the_same_way():
+    T = np.tile(np.eye(4), (5, 1, 1))
+    T[1, :3, 3] = [0.9 * CROWD_M, 0, 0]
+    T[2, :3, 3] = [1.1 * CROWD_M, 0, 0]
+    T[3] = se3.exp(np.array([0, 0, 0, 0, np.radians(5.5), 0]))
+    T[4] = se3.exp(np.array([0, 0, 0, 0, np.radians(6.5), 0]))
+    assert count_crowd(T, np.eye(4)) == 3
+    assert count_crowd(T[:0], np.eye(4)) == 0
