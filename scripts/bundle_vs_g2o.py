@@ -45,7 +45,8 @@ def drive(n_kf: int, n_lm: int, seed: int) -> tuple:
     error = rng.normal(size=(n_kf, 6)) * [0.02, 0.02, 0.02, 0.01, 0.01, 0.01]
     error[0] = 0.0
     x_w = x_true + 0.03 * rng.normal(size=x_true.shape)
-    return se3.exp(error) @ T_true, x_w, obs_kf, obs_lm, xy, depth, sigma_px, sigma_z, CAMERA
+    seen = bundle_adjustment.Observations(obs_kf, obs_lm, xy, depth, sigma_px, sigma_z)
+    return se3.exp(error) @ T_true, x_w, seen, CAMERA
 
 
 def cpu_ms(function) -> float:

@@ -30,7 +30,7 @@ from slamcli.geometry.octree import Octree, expand, prune
 from slamcli.parallel import one_thread_in_blas
 from slamcli.runs.run_directory import RunDir
 from slamcli.schema import Features, Ground, Map
-from slamcli.stages.densify import depth_poses
+from slamcli.stages.depth_frames import depth_poses
 from slamcli.stages.octree import scans
 
 MODEL = {"hit": 0.7, "miss": 0.4, "clamp_min": 0.1192, "clamp_max": 0.971}  # OctoMap's own

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from slamcli.estimation import bundle_adjustment
+from slamcli.estimation.bundle_adjustment import Observations
 from slamcli.geometry import se3
 from slamcli.geometry.camera import Camera
 
@@ -29,7 +30,8 @@ class Scene:
 
     @property
     def problem(self) -> tuple:
-        return self.T_cw, self.x_w, self.obs_kf, self.obs_lm, self.xy, self.depth, self.sigma_px, self.sigma_z, CAMERA
+        seen = Observations(self.obs_kf, self.obs_lm, self.xy, self.depth, self.sigma_px, self.sigma_z)
+        return self.T_cw, self.x_w, seen, CAMERA
 
     @property
     def first(self) -> np.ndarray:

@@ -245,25 +245,23 @@ def huber(chi2: float, limit: float) -> float:
     return chi2 if chi2 <= limit else 2.0 * np.sqrt(limit * chi2) - limit
 
 
-def bundle_cost(T_cw, x_w, obs_kf, obs_lm, xy, depth, sigma_px, sigma_z, camera, limits=(np.inf, np.inf)) -> float:
+def bundle_cost(T_cw, x_w, seen, camera, limits=(np.inf, np.inf)) -> float:
     """Sum of the costs of all observations."""
     cost = 0.0
-    for o, (k, lm) in enumerate(zip(obs_kf, obs_lm, strict=True)):
-        r = residual(T_cw[k], x_w[lm], xy[o], depth[o], sigma_px[o], sigma_z[o], camera)
+    for o, (k, lm) in enumerate(zip(seen.kf, seen.lm, strict=True)):
+        r = residual(T_cw[k], x_w[lm], seen.xy[o], seen.depth[o], seen.sigma_px[o], seen.sigma_z[o], camera)
         cost += huber(r @ r, limits[len(r) - 2])
     return cost
 
 
-def bundle_normal_equations(
-    T_cw, x_w, obs_kf, obs_lm, xy, depth, sigma_px, sigma_z, camera, limits=(np.inf, np.inf)
-) -> tuple[np.ndarray, np.ndarray]:
+def bundle_normal_equations(T_cw, x_w, seen, camera, limits=(np.inf, np.inf)) -> tuple[np.ndarray, np.ndarray]:
     """H = sum w J^T J and b = -sum w J^T r over all key frames, then all landmarks; J by central differences through the retraction."""
     from slamcli.geometry import se3
 
     n_pose = 6 * len(T_cw)
     H, b, h = np.zeros((n_pose + 3 * len(x_w),) * 2), np.zeros(n_pose + 3 * len(x_w)), 1e-6
-    for o, (k, lm) in enumerate(zip(obs_kf, obs_lm, strict=True)):
-        measured = (xy[o], depth[o], sigma_px[o], sigma_z[o], camera)
+    for o, (k, lm) in enumerate(zip(seen.kf, seen.lm, strict=True)):
+        measured = (seen.xy[o], seen.depth[o], seen.sigma_px[o], seen.sigma_z[o], camera)
         r = residual(T_cw[k], x_w[lm], *measured)
         J = np.zeros((len(r), 9))
         for i, step in enumerate(h * np.eye(6)):

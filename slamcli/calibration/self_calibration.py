@@ -1,11 +1,4 @@
-"""What the recording itself says about its camera: numbers that all observations share, found together with the map.
-
-A shared number g moves each measurement by J g. At the optimum of a bundle adjustment, with r the residuals, H and b the normal equations
-of key frames and landmarks and C = J_map^T w J, eliminating the map leaves
-
-    (J^T w J - C^T H^-1 C) g = J^T w r - C^T H^-1 J_map^T w r
-
-which is small, and whose inverse is the covariance of g.
+"""What the recording itself says about its camera: numbers that all observations share, found together with the map (`estimation/shared_parameters.py`).
 
 A factor on all depth readings stays as it is believed to be: a world, a path and depths that are all stretched alike show the same
 pictures. An offset of inverse depth, as of a sensor whose disparities are off by a constant, bends the world and is found.
@@ -17,7 +10,7 @@ import numpy as np
 
 from slamcli.calibration import rolling_shutter
 from slamcli.config.options import OptimizeConfig, SensorConfig
-from slamcli.estimation import bundle_adjustment, bundle_kernels
+from slamcli.estimation import bundle_adjustment, shared_parameters
 from slamcli.geometry.camera import Camera
 from slamcli.schema import Features, Timing
 from slamcli.sparse_map import map_adjustment
@@ -26,14 +19,6 @@ from slamcli.sparse_map.sparse_map import MapBuilder
 TIMES = "readout", "depth_readout", "depth_delay"  # fields of Timing that are looked for
 SIGNIFICANT = 3.0  # standard deviations
 STEP = 1e-3  # of its prior sigma, by which an unknown of the calibration is moved to see what that does
-
-
-@dataclass(frozen=True)
-class Shared:
-    """The numbers found and how sure they are."""
-
-    value: np.ndarray  # (G,)
-    sigma: np.ndarray  # (G,) standard deviations
 
 
 @dataclass(frozen=True)
@@ -89,16 +74,16 @@ def estimate_sensing(builder: MapBuilder, given: Camera, now: Sensing, sensor: S
     if len(part.row) == 0 or not prior:
         return None
     T_kw, x_w = builder.T_kw(part.kfs), builder.lm.xyz[part.ids]
-    problem = bundle_adjustment.Problem(T_kw, x_w, *part.arguments, now.camera, part.is_fixed, part.edges)
+    problem = bundle_adjustment.Problem(T_kw, x_w, part.seen, now.camera, part.is_fixed, part.edges)
     names = list(prior)
-    predicted = problem.in_given_order(residuals(problem, problem.T, problem.x) + problem.measured[:, :3])
+    predicted = problem.in_given_order(problem.predict(problem.T, problem.x))
     # What an offset bends is to turn about readings of this depth, so that it changes no size that the depth scale answers for.
     pivot = float(np.median(predicted[:, 2]))
     columns = np.stack([_column(name, builder.features, part.row, predicted, now, prior[name], pivot) for name in names], axis=2)
     value, centre = (
         np.array([_number(name, camera, when, pivot) for name in names]) for camera, when in ((now.camera, now.timing), (given, None))
     )
-    found = estimate(problem, problem.T, problem.x, columns, prior=centre - value, prior_sigma=np.array(list(prior.values())))
+    found = shared_parameters.estimate(problem, columns, prior=centre - value, prior_sigma=np.array(list(prior.values())))
     if found is None:
         return None
     value = value + found.value
@@ -151,69 +136,3 @@ def _column(name: str, features: Features, rows: np.ndarray, predicted: np.ndarr
     focal = np.array([now.camera.fx, now.camera.fy])
     column[:, :2] = (ahead.normalise(raw) - behind.normalise(raw)) * focal / (2.0 * step)
     return column
-
-
-def estimate(
-    problem: bundle_adjustment.Problem,
-    T_cw: np.ndarray,
-    x_w: np.ndarray,
-    columns: np.ndarray,
-    *,
-    prior: np.ndarray,
-    prior_sigma: np.ndarray,
-) -> Shared | None:
-    """Find the shared numbers at an adjusted map.
-
-    columns : (O, 3, G) by how much u, v [px] and depth [m] of each observation grow per unit of each number
-    prior, prior_sigma : (G,) what is believed before looking. None where the map is not determined.
-    """
-    # Outliers stay out; among the inliers Huber's weights are close to 1 and are left out.
-    no_limits = np.array([np.inf, np.inf])
-    chi2 = problem.chi2(T_cw, x_w)
-    is_used = chi2 <= problem.threshold(np.array([bundle_adjustment.CHI2_95_2DOF, bundle_adjustment.CHI2_95_3DOF]))
-    measured = problem.measured.copy()
-    columns = columns[problem.order]
-    sqrt_w = measured[:, [3, 3, 4]] * is_used[:, None]
-    problem.measured[:, 3:] *= is_used[:, None]
-    r = residuals(problem, T_cw, x_w) * sqrt_w
-    systems = []
-    for g in range(-1, columns.shape[2]):  # -1: the map's own residuals; then each shared number in turn
-        problem.measured[:, :3] = measured[:, :3]
-        if g >= 0:
-            problem.measured[:, :3] += columns[:, :, g]
-        problem.linearize(T_cw, x_w, no_limits)
-        problem.eliminate(bundle_adjustment.DAMPING_MIN, problem.hold)
-        systems.append((problem.rhs.copy().ravel(), problem.b_l.copy()))
-    V_inv = problem.V_inv.copy()
-    factor = problem.system.factorise()
-    problem.measured[:] = measured
-    if factor is None:
-        return None
-    rhs_0, b_0 = systems[0]
-    reduced = np.array([rhs - rhs_0 for rhs, _ in systems[1:]])
-    lifted = np.array([b - b_0 for _, b in systems[1:]])
-    solved = factor.solve(np.ascontiguousarray(np.concatenate([reduced, rhs_0[None]]).T)).T
-    J = (columns * sqrt_w[:, :, None]).reshape(-1, columns.shape[2])
-    through_landmarks = np.array([[_landmark_product(a, V_inv, b) for b in (*lifted, b_0)] for a in lifted])
-    through_map = reduced @ solved.T + through_landmarks
-    A = J.T @ J - through_map[:, :-1] + np.diag(prior_sigma**-2.0)
-    # b is minus the gradient: J_map^T w r = -b_0
-    value = np.linalg.solve(A, J.T @ r.ravel() + through_map[:, -1] + prior * prior_sigma**-2.0)
-    return Shared(value=value, sigma=np.sqrt(np.diag(np.linalg.inv(A))))
-
-
-def residuals(problem: bundle_adjustment.Problem, T_cw: np.ndarray, x_w: np.ndarray) -> np.ndarray:
-    """Give prediction minus measurement (O, 3) [px, px, m] in the problem's order."""
-    lm = np.repeat(np.arange(len(x_w)), np.diff(problem.offset))
-    T = T_cw[problem.obs_kf.astype(np.int64)]
-    x_c = np.einsum("oij,oj->oi", T[:, :3, :3], x_w[lm]) + T[:, :3, 3]
-    z = np.maximum(x_c[:, 2], bundle_kernels.Z_MIN)
-    fx, fy, cx, cy = problem.camera
-    predicted = np.stack([fx * x_c[:, 0] / z + cx, fy * x_c[:, 1] / z + cy, z], axis=1)
-    return predicted - problem.measured[:, :3]
-
-
-def _landmark_product(a: np.ndarray, V_inv: np.ndarray, b: np.ndarray) -> float:
-    """Sum a^T V^-1 b over the landmarks; V_inv (L, 6) upper triangles."""
-    rows = ((0, 1, 2), (1, 3, 4), (2, 4, 5))
-    return float(sum((a[:, i] * V_inv[:, rows[i][j]] * b[:, j]).sum() for i in range(3) for j in range(3)))

@@ -73,7 +73,7 @@ def export_octree(out: Path, run: str | None, colour: bool) -> None:
 def _export_colour_octree(out: Path, folder: RunDir) -> None:
     from slamcli.formats import cloud, octomap
 
-    xyz, rgb, _ = cloud.read_ply(folder.stage_path("densify", "cloud.ply"))
+    xyz, rgb, _ = cloud.read_coloured_ply(folder.stage_path("densify", "cloud.ply"))
     tree = octomap.read(folder.stage_path("octree", "map.ot"))
     octomap.write_colour_ot(out, tree, xyz, rgb, parents=folder.config().octree.parents)
 
@@ -97,12 +97,13 @@ def export_mesh(out: Path, run: str | None, voxel: float) -> None:
     from slamcli.runs.run_directory import RunDir
     from slamcli.schema import Ground
     from slamcli.stages import densify
+    from slamcli.stages.depth_frames import depth_poses
 
     _check_suffix(out, ".ply")
     folder = RunDir.find(run)
     config, camera, T_lw = folder.config(), folder.camera("loop"), folder.load(Ground, "densify").T_lw
     option = replace(config.densify, method="tsdf", voxel=voxel)
-    poses = console.progress(densify.depth_poses(folder), "mesh")
+    poses = console.progress(depth_poses(folder), "mesh")
     volume = Volume(camera, voxel=voxel, depth_max=option.depth_max)
     for view in densify.views(folder.dataset(), camera, poses, config.sensor, option, workers=config.run.workers):
         volume.add(view.seen, view.rgb, view.T_wk)
@@ -154,7 +155,7 @@ def _draw_cloud(folder: RunDir, view: View, path: np.ndarray | None) -> np.ndarr
     from slamcli.formats import cloud
     from slamcli.visualization import render
 
-    xyz, rgb, normal = cloud.read_ply(folder.stage_path("densify", "cloud.ply"))
+    xyz, rgb, normal = cloud.read_coloured_ply(folder.stage_path("densify", "cloud.ply"))
     return render.draw_cloud(xyz, rgb, normal, spacing=folder.config().densify.voxel, view=view, path=path)
 
 

@@ -74,4 +74,4 @@ def _is_in_view(x_c: np.ndarray, camera: Camera) -> np.ndarray:
     """Say of points (..., 3) [m, camera] whether they lie in the picture, lens distortion aside."""
     xy = camera.project(np.where(x_c[..., 2:] > 0.0, x_c, np.nan))
     with np.errstate(invalid="ignore"):
-        return ((xy >= 0.0) & (xy < [camera.width, camera.height])).all(axis=-1)
+        return np.all((xy >= 0.0) & (xy < [camera.width, camera.height]), axis=-1)

@@ -48,14 +48,14 @@ class OccupancyMap:
         """
         self.resolution = float(resolution)
         self._update = log_odds(miss), log_odds(hit), log_odds(clamp_min), log_odds(clamp_max)
-        columns = {"log_odds": (np.float32, np.nan), "misses": (np.uint8, 0), "last_hit": (np.int32, 0)}
-        self._blocks = voxel.VoxelRows(**{name: ((BLOCK_CELLS,), *of) for name, of in columns.items()})
+        row = (BLOCK_CELLS,)
+        self._blocks = voxel.VoxelRows(log_odds=(row, np.float32, np.nan), misses=(row, np.uint8, 0), last_hit=(row, np.int32, 0))
 
     @property
     def looks(self) -> int:
         """Give how many misses make the surest cell free."""
         miss, _, lowest, highest = self._update
-        return int(np.ceil((highest - max(lowest, 0.0)) / -miss))
+        return int(np.ceil((highest - np.maximum(lowest, 0.0)) / -miss))
 
     def insert(self, x_w: np.ndarray, origin: np.ndarray, *, max_range: float, discretise: bool = False, frame: int = 0) -> None:
         """Insert one scan.

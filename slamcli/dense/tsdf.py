@@ -50,7 +50,8 @@ class Volume:
         self._K = core.Tensor(camera.K)
         # Open3D knows no lens distortion: its images are looked up at the raw pixels.
         u, v = np.meshgrid(np.arange(camera.width, dtype=np.float64), np.arange(camera.height, dtype=np.float64))
-        self._raw = camera.distort(np.stack([u, v], axis=-1)).astype(np.float32)
+        raw = camera.distort(np.stack([u, v], axis=-1)).astype(np.float32)
+        self._raw_u, self._raw_v = np.ascontiguousarray(raw[..., 0]), np.ascontiguousarray(raw[..., 1])
 
     def add(self, seen: Surface, rgb: np.ndarray, T_wc: np.ndarray) -> None:
         """Integrate what one key frame saw; `seen` at stride 1, `rgb` (H, W, 3) uint8."""
@@ -59,8 +60,8 @@ class Volume:
         if not depth.any():
             return
         image = self._o3d.t.geometry.Image
-        depth_image = image(cv2.remap(depth, self._raw, None, cv2.INTER_NEAREST))
-        colour = image(cv2.remap(rgb.astype(np.float32) / 255.0, self._raw, None, cv2.INTER_LINEAR))
+        depth_image = image(cv2.remap(depth, self._raw_u, self._raw_v, cv2.INTER_NEAREST))
+        colour = image(cv2.remap(rgb.astype(np.float32) / 255.0, self._raw_u, self._raw_v, cv2.INTER_LINEAR))
         T_cw = self._o3d.core.Tensor(se3.inverse(T_wc))
         where = self._grid.compute_unique_block_coordinates(depth_image, self._K, T_cw, 1.0, self._depth_max, TRUNCATION)
         self._grid.integrate(where, depth_image, colour, self._K, T_cw, 1.0, self._depth_max, TRUNCATION)

@@ -20,6 +20,21 @@ HOLD = 1.0 / 0.02**2  # [1/m^2, 1/rad^2] added to its diagonal in every iteratio
 
 
 @dataclass(frozen=True)
+class Observations:
+    """Landmarks seen by key frames, sorted by landmark, with what was measured and how well."""
+
+    kf: np.ndarray  # (O,) key frame
+    lm: np.ndarray  # (O,) landmark, not decreasing
+    xy: np.ndarray  # (O, 2) px, undistorted
+    depth: np.ndarray  # (O,) m, NaN = bearing only
+    sigma_px: np.ndarray  # (O,) px, standard deviation
+    sigma_z: np.ndarray  # (O,) m, standard deviation, NaN where depth is
+
+    def __len__(self) -> int:
+        return len(self.kf)
+
+
+@dataclass(frozen=True)
 class BundleResult:
     """The adjusted poses and landmarks and the evidence for them."""
 
@@ -60,12 +75,7 @@ class PoseCovariance:
 def adjust(
     T_cw: np.ndarray,
     x_w: np.ndarray,
-    obs_kf: np.ndarray,
-    obs_lm: np.ndarray,
-    xy: np.ndarray,
-    depth: np.ndarray,
-    sigma_px: np.ndarray,
-    sigma_z: np.ndarray,
+    seen: Observations,
     camera: Camera,
     *,
     is_fixed: np.ndarray,
@@ -81,8 +91,6 @@ def adjust(
     """Adjust the free key frames and all landmarks to pixels and depths.
 
     T_cw : (K, 4, 4); x_w : (L, 3) [m]; is_fixed : (K,) bool, key frames that stay
-    obs_kf, obs_lm : (O,) key frame and landmark of each observation, sorted by landmark
-    xy : (O, 2) [px, undistorted]; depth : (O,) [m], NaN = bearing only; sigma_px, sigma_z : (O,) [px, m] standard deviations
     edges : relative poses of key frames that were measured besides
 
     Minimises the sum over observations and edges of Huber's function of chi2, for observations = |xy - pi(x)|^2 / sigma_px^2 + (depth - z)^2 / sigma_z^2, which is
@@ -91,18 +99,17 @@ def adjust(
     by less than the share `tolerance`. A landmark seen once is adjusted with its depth; with one bearing alone it bears on nothing.
     Values that are not finite switch their observation off.
     """
-    problem = Problem(T_cw, x_w, obs_kf, obs_lm, xy, depth, sigma_px, sigma_z, camera, is_fixed, edges)
+    problem = Problem(T_cw, x_w, seen, camera, is_fixed, edges)
     quantiles = np.array([chi2_px, chi2_depth], dtype=np.float64)
     limits = quantiles if robust else np.array([np.inf, np.inf])
     T, x, cost, iterations, is_converged = _minimise(problem, problem.T, problem.x, limits, max_iterations, tolerance)
+    in_use = problem.measured[:, 3].copy()
     if outlier_iterations:
-        in_use = problem.measured[:, 3].copy()
         problem.measured[problem.chi2(T, x) > problem.threshold(quantiles), 3] = 0.0
         T, x, more, extra, is_converged = _minimise(problem, T, x, limits, outlier_iterations, tolerance)
         cost, iterations = cost + more, iterations + extra
     covariance = problem.covariance(T, x, limits) if with_covariance else None
-    if outlier_iterations:
-        problem.measured[:, 3] = in_use
+    problem.measured[:, 3] = in_use
     chi2 = problem.chi2(T, x)
     is_inlier = chi2 <= problem.threshold(quantiles)
     x = np.where(problem.is_finite_landmark[:, None], x, np.nan)
@@ -143,15 +150,18 @@ def _minimise(
 class Problem:
     """The observations as the kernels want them, and the work space of the normal equations."""
 
-    def __init__(self, T_cw, x_w, obs_kf, obs_lm, xy, depth, sigma_px, sigma_z, camera, is_fixed, edges: Edges = NO_EDGES) -> None:
-        obs_kf, obs_lm = np.asarray(obs_kf, dtype=np.int64), np.asarray(obs_lm, dtype=np.int64)
+    def __init__(
+        self, T_cw: np.ndarray, x_w: np.ndarray, seen: Observations, camera: Camera, is_fixed: np.ndarray, edges: Edges = NO_EDGES
+    ) -> None:
+        """Take what `adjust` takes; raises ValueError where the observations are not sorted by landmark."""
+        obs_kf, obs_lm = np.asarray(seen.kf, dtype=np.int64), np.asarray(seen.lm, dtype=np.int64)
         if (np.diff(obs_lm) < 0).any():
             raise ValueError("observations must be sorted by landmark")
         self.T = np.array(T_cw, dtype=np.float64, order="C")
         self.x = np.array(x_w, dtype=np.float64, order="C").reshape(-1, 3)
-        self.is_finite_landmark = np.isfinite(self.x).all(axis=1)
+        self.is_finite_landmark = np.all(np.isfinite(self.x), axis=1)
         self.x[~self.is_finite_landmark] = 0.0  # nothing observes it now, and NaN would spread
-        measured = _measurements(xy, depth, sigma_px, sigma_z, self.is_finite_landmark[obs_lm])
+        measured = _measurements(seen, self.is_finite_landmark[obs_lm])
         in_use = measured[:, 3] > 0.0
         n_seen = np.bincount(obs_kf[in_use], minlength=len(self.T))
         n_seen += FEW_OBSERVATIONS * np.bincount(edges.kf.ravel(), minlength=len(self.T))  # an edge determines a pose by itself
@@ -193,11 +203,21 @@ class Problem:
         chi2 = self._evaluate(T, x, np.array([np.inf, np.inf]))[1]
         return np.where((self.measured[:, 3] == 0.0) | (chi2 >= kernels.CHI2_BEHIND), np.inf, chi2)
 
-    def linearize(self, T: np.ndarray, x: np.ndarray, limits: np.ndarray) -> None:
-        """Fill the blocks of the normal equations U, b_c, V, b_l, W."""
+    def predict(self, T: np.ndarray, x: np.ndarray) -> np.ndarray:
+        """Project the landmarks into the key frames that see them, (O, 3) u, v [px], depth [m], in the problem's order."""
+        lm = np.repeat(np.arange(len(x)), np.diff(self.offset))
+        T_of = T[self.obs_kf.astype(np.int64)]
+        x_c = np.einsum("oij,oj->oi", T_of[:, :3, :3], x[lm]) + T_of[:, :3, 3]
+        z = np.maximum(x_c[:, 2], kernels.Z_MIN)
+        fx, fy, cx, cy = self.camera
+        return np.stack([fx * x_c[:, 0] / z + cx, fy * x_c[:, 1] / z + cy, z], axis=1)
+
+    def linearize(self, T: np.ndarray, x: np.ndarray, limits: np.ndarray, *, measured: np.ndarray | None = None) -> None:
+        """Fill the blocks of the normal equations U, b_c, V, b_l, W; `measured` (O, 5) stands in for what was measured."""
         for block in (self.U, self.b_c, self.V, self.b_l):
             block.fill(0.0)
-        observations = (self.obs_kf, self.offset, self.place, self.measured, self.camera)
+        measured = self.measured if measured is None else measured
+        observations = (self.obs_kf, self.offset, self.place, measured, self.camera)
         kernels.linearize(T, x, *observations, limits, self.U, self.b_c, self.V, self.b_l, self.W)
         self.edge_terms.linearize(T, np.isfinite(limits).all(), self.U, self.b_c)
 
@@ -232,11 +252,11 @@ def _stable_order(key: np.ndarray) -> np.ndarray:
     return np.arange(len(key)) if (key[1:] >= key[:-1]).all() else np.argsort(key, kind="stable")
 
 
-def _measurements(xy, depth, sigma_px, sigma_z, is_finite_landmark: np.ndarray) -> np.ndarray:
+def _measurements(seen: Observations, is_finite_landmark: np.ndarray) -> np.ndarray:
     """Join what was measured to rows (O, 5) u, v, depth, 1 / sigma_px, 1 / sigma_z, with 0 for what is missing or not finite."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        inv_px, inv_z = 1.0 / np.asarray(sigma_px, dtype=np.float64), 1.0 / np.asarray(sigma_z, dtype=np.float64)
-    xy, depth = np.asarray(xy, dtype=np.float64).reshape(-1, 2), np.asarray(depth, dtype=np.float64)
+        inv_px, inv_z = 1.0 / np.asarray(seen.sigma_px, dtype=np.float64), 1.0 / np.asarray(seen.sigma_z, dtype=np.float64)
+    xy, depth = np.asarray(seen.xy, dtype=np.float64).reshape(-1, 2), np.asarray(seen.depth, dtype=np.float64)
     is_valid = np.isfinite(xy).all(axis=1) & np.isfinite(inv_px) & is_finite_landmark
     has_depth = is_valid & np.isfinite(depth) & np.isfinite(inv_z)
     measured = np.zeros((len(xy), 5))

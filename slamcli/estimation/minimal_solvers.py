@@ -43,7 +43,7 @@ def _distances(laws: np.ndarray) -> np.ndarray:
         [-0.5 * a23 * b13 * g, 0.5 * b23 * (a13 * g - a12), g * (a13 - a23) - a12],
     ]
     form = np.moveaxis(np.array(rows), -1, 0)
-    is_finite = np.isfinite(form).all(axis=(1, 2))
+    is_finite = np.all(np.isfinite(form), axis=(1, 2))
     value, vector = np.linalg.eigh(np.where(is_finite[:, None, None], form, np.eye(3)))
     # One eigenvalue is 0 up to rounding, the middle one, as those of a pair of real planes have opposite signs.
     slope = np.sqrt(-value[:, 0] / value[:, 2])

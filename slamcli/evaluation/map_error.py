@@ -14,7 +14,7 @@ from slamcli.geometry import se3
 from slamcli.navigation import grid
 from slamcli.runs.run_directory import RunDir
 from slamcli.schema import Features, Grid, Ground, Map, Tracks, frame_poses
-from slamcli.stages.densify import depth_poses
+from slamcli.stages.depth_frames import depth_poses
 from slamcli.stages.octree import scans
 
 Progress = Callable[..., Iterable]

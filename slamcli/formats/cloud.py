@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, Literal
 
 import numpy as np
 
@@ -69,7 +69,7 @@ def _vertices(xyz: np.ndarray, rgb: np.ndarray | None, normal: np.ndarray | None
 
 def _ply_header(vertex: np.ndarray, *, n_faces: int | None) -> bytes:
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertex)}"]
-    lines += [f"property {PLY_NAME[kind[1:]]} {name}" for name, kind in vertex.dtype.descr]
+    lines += [f"property {PLY_NAME[vertex.dtype[name].str[1:]]} {name}" for name in _names(vertex.dtype)]
     if n_faces is not None:
         lines += [f"element face {n_faces}", "property list uchar int vertex_indices"]
     return "\n".join([*lines, "end_header", ""]).encode()
@@ -82,6 +82,14 @@ def read_ply(path: Path) -> Points:
         if layout == "ascii":
             return _points(path, _read_text(path, file, dtype, n))
         return _points(path, _read_records(path, file, dtype, n))
+
+
+def read_coloured_ply(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    """Read the vertices of a PLY file as `read_ply` does; SlamError also where they have no colours."""
+    xyz, rgb, normal = read_ply(path)
+    if rgb is None:
+        raise SlamError(f"{path}: the points have no colours (red green blue)")
+    return xyz, rgb, normal
 
 
 def _read_ply_header(path: Path, file: BinaryIO) -> tuple[str, np.dtype, int]:
@@ -102,8 +110,7 @@ def _read_ply_header(path: Path, file: BinaryIO) -> tuple[str, np.dtype, int]:
             if len(words) != 3 or words[1] not in PLY_TYPE:
                 raise SlamError(f"{path}: the vertex property {' '.join(words[1:])[:60]!r} cannot be read")
             fields.append((words[2], PLY_TYPE[words[1]]))
-    order = ">" if layout == "binary_big_endian" else "<"
-    return layout, _record_type(path, fields, order), n
+    return layout, _record_type(path, fields, ">" if layout == "binary_big_endian" else "<"), n
 
 
 def write_pcd(path: Path, xyz: np.ndarray, rgb: np.ndarray | None = None, normal: np.ndarray | None = None) -> None:
@@ -119,7 +126,7 @@ def write_pcd(path: Path, xyz: np.ndarray, rgb: np.ndarray | None = None, normal
     k = len(columns)
     header = (
         "# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\n"
-        f"FIELDS {' '.join(point.dtype.names)}\nSIZE{' 4' * k}\nTYPE{' F' * k}\nCOUNT{' 1' * k}\n"
+        f"FIELDS {' '.join(name for name, _ in columns)}\nSIZE{' 4' * k}\nTYPE{' F' * k}\nCOUNT{' 1' * k}\n"
         f"WIDTH {len(point)}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {len(point)}\nDATA binary\n"
     )
     with open(path, "wb") as file:
@@ -174,7 +181,7 @@ def _count(path: Path, text: str, what: str) -> int:
     return int(text)
 
 
-def _record_type(path: Path, fields: list[tuple[str, str]], order: str) -> np.dtype:
+def _record_type(path: Path, fields: list[tuple[str, str]], order: Literal["<", ">"]) -> np.dtype:
     names = [name for name, _ in fields]
     if len(set(names)) != len(names) or not {"x", "y", "z"} <= set(names):
         raise SlamError(f"{path}: the points have no x, y and z, or a field twice")
@@ -184,6 +191,10 @@ def _record_type(path: Path, fields: list[tuple[str, str]], order: str) -> np.dt
         raise SlamError(f"{path}: the header gives a field a type that is not known") from None
 
 
+def _names(dtype: np.dtype) -> tuple[str, ...]:
+    return dtype.names or ()
+
+
 def _read_records(path: Path, file: BinaryIO, dtype: np.dtype, n: int) -> dict[str, np.ndarray]:
     here = file.tell()
     available = file.seek(0, 2) - here
@@ -191,11 +202,11 @@ def _read_records(path: Path, file: BinaryIO, dtype: np.dtype, n: int) -> dict[s
         raise SlamError(f"{path}: is cut off: {n} points need {n * dtype.itemsize} bytes, {available} are there")
     file.seek(here)
     records = np.frombuffer(file.read(n * dtype.itemsize), dtype=dtype)
-    return {name: records[name] for name in dtype.names}
+    return {name: records[name] for name in _names(dtype)}
 
 
 def _read_text(path: Path, file: BinaryIO, dtype: np.dtype, n: int) -> dict[str, np.ndarray]:
-    words, names = file.read().split(), dtype.names
+    words, names = file.read().split(), _names(dtype)
     if n * len(names) > len(words):
         raise SlamError(f"{path}: is cut off: {n} points need {n * len(names)} numbers, {len(words)} are there")
     try:
@@ -207,11 +218,11 @@ def _read_text(path: Path, file: BinaryIO, dtype: np.dtype, n: int) -> dict[str,
 
 def _points(path: Path, columns: dict[str, np.ndarray]) -> Points:
     def group(names: str, dtype: type) -> np.ndarray | None:
-        present = [columns.get(name) for name in names.split()]
-        return None if any(column is None for column in present) else np.column_stack(present).astype(dtype)
+        present = [columns[name] for name in names.split() if name in columns]
+        return np.column_stack(present).astype(dtype) if len(present) == len(names.split()) else None
 
     xyz = group("x y z", np.float32)
-    if not np.isfinite(xyz).all():
+    if xyz is None or not np.isfinite(xyz).all():
         raise SlamError(f"{path}: holds a point that is not finite")
     rgb = group("red green blue", np.uint8)
     packed = columns.get("rgb")

@@ -24,10 +24,10 @@ def write_g2o(
     with Path(path).open("w", encoding="ascii", newline="\n") as file:
         for k, row in enumerate(pose):
             file.write(f"VERTEX_SE3:QUAT {k} {_numbers(row)}\n")
-        for k in np.flatnonzero(is_fixed):
-            file.write(f"FIX {k}\n")
-        for (i, j), row, omega in zip(np.asarray(edge_kf).tolist(), measurement, upper, strict=True):
-            file.write(f"EDGE_SE3:QUAT {i} {j} {_numbers(row)} {_numbers(omega)}\n")
+        for fixed in np.flatnonzero(is_fixed).tolist():
+            file.write(f"FIX {fixed}\n")
+        for (kf_i, kf_j), row, omega in zip(np.asarray(edge_kf).tolist(), measurement, upper, strict=True):
+            file.write(f"EDGE_SE3:QUAT {kf_i} {kf_j} {_numbers(row)} {_numbers(omega)}\n")
 
 
 @dataclass(frozen=True)

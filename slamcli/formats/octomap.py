@@ -5,7 +5,7 @@ doi:10.1007/s10514-012-9321-0, section 4.4; checked against the C++ library.
 """
 
 from pathlib import Path
-from typing import BinaryIO, Literal
+from typing import BinaryIO
 
 import numpy as np
 
@@ -30,14 +30,14 @@ FAULT = {
 }
 
 
-def write_ot(path: Path, tree: Octree, *, parents: Literal["max", "mean"] = "max") -> int:
+def write_ot(path: Path, tree: Octree, *, parents: str = "max") -> int:
     """Write the tree with its log-odds; returns the number of nodes."""
     record, _ = _records(tree, parents, NODE)
     _write(path, ".ot", tree.resolution, len(record), record)
     return len(record)
 
 
-def write_colour_ot(path: Path, tree: Octree, xyz: np.ndarray, rgb: np.ndarray, *, parents: Literal["max", "mean"] = "max") -> int:
+def write_colour_ot(path: Path, tree: Octree, xyz: np.ndarray, rgb: np.ndarray, *, parents: str = "max") -> int:
     """Write the tree with the mean colour of the points in each occupied node, as a ColorOcTree; returns the number of nodes.
 
     xyz : (N, 3) [m], in the tree's frame; rgb : (N, 3) uint8
@@ -58,7 +58,7 @@ def write_colour_ot(path: Path, tree: Octree, xyz: np.ndarray, rgb: np.ndarray, 
     return len(record)
 
 
-def _records(tree: Octree, parents: Literal["max", "mean"], dtype: np.dtype) -> tuple[np.ndarray, list[Level]]:
+def _records(tree: Octree, parents: str, dtype: np.dtype) -> tuple[np.ndarray, list[Level]]:
     """Give all nodes depth first, with log-odds and children filled in, and level by level."""
     nodes = levels(tree, parents=parents)
     record = np.empty(_n_nodes(nodes), dtype=dtype)
@@ -153,7 +153,7 @@ def _read_header(path: Path, file: BinaryIO) -> tuple[str, str, int, float]:
     kind = values.get("id", "(none)")
     if kind not in ("OcTree", "ColorOcTree"):
         raise SlamError(f"{path}: holds a tree of type {kind[:40]!r}; only OcTree and ColorOcTree can be read")
-    return suffix, kind, _number(path, values, "size", int, 0, 1 << 62), _number(path, values, "res", float, 1e-6, 1e6)
+    return suffix, kind, int(_number(path, values, "size", int, 0, 1 << 62)), float(_number(path, values, "res", float, 1e-6, 1e6))
 
 
 def _number(path: Path, values: dict[str, str], name: str, kind: type, low: float, high: float) -> int | float:

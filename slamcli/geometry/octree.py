@@ -7,7 +7,6 @@ A. Hornung et al., OctoMap, Autonomous Robots 2013, doi:10.1007/s10514-012-9321-
 """
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
@@ -46,7 +45,7 @@ class Octree:
     def find(self, cell: np.ndarray) -> np.ndarray:
         """Give the row of the leaf that holds each cell (M, 3), -1 where space is unknown."""
         cell = np.asarray(cell, dtype=np.int64)
-        inside = ((cell >= 0) & (cell < 1 << DEPTH)).all(axis=-1)
+        inside = np.all((cell >= 0) & (cell < 1 << DEPTH), axis=-1)
         key = voxel.morton(np.where(inside[..., None], cell, 0))
         row = np.searchsorted(self.key, key, side="right") - 1
         found = inside & (row >= 0)
@@ -65,12 +64,12 @@ def prune(tree: Octree) -> Octree:
     """Merge eight equal sibling leaves into their parent, again and again from the finest level up."""
     done: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
     key, log_odds = tree.key[tree.depth == DEPTH], tree.log_odds[tree.depth == DEPTH]
-    for depth in range(DEPTH, 0, -1):
-        first = _whole_families(key >> 3 * (DEPTH - depth), log_odds)
+    for level in range(DEPTH, 0, -1):
+        first = _whole_families(key >> 3 * (DEPTH - level), log_odds)
         merged = np.zeros(len(key), dtype=bool)
         merged[(first[:, None] + np.arange(8)).ravel()] = True
-        done.append((key[~merged], np.full((~merged).sum(), depth, dtype=np.uint8), log_odds[~merged]))
-        above = tree.depth == depth - 1
+        done.append((key[~merged], np.full((~merged).sum(), level, dtype=np.uint8), log_odds[~merged]))
+        above = tree.depth == level - 1
         key = np.concatenate([key[first], tree.key[above]])
         log_odds = np.concatenate([log_odds[first], tree.log_odds[above]])
         order = np.argsort(key, kind="stable")
@@ -108,7 +107,7 @@ class Level:
     n_inner: np.ndarray  # (M,) int64, inner nodes of the subtree
 
 
-def levels(tree: Octree, *, parents: Literal["max", "mean"] = "max", threshold: float = 0.0) -> list[Level]:
+def levels(tree: Octree, *, parents: str = "max", threshold: float = 0.0) -> list[Level]:
     """Give the nodes from the root (index 0) to depth 16; an empty tree has none at any depth.
 
     parents : "max" is OctoMap's rule for inner values; "mean" is that of Zhao et al. (14), the mean over all eight children,

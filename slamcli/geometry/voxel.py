@@ -98,7 +98,7 @@ class VoxelRows:
     Attributes: `slot_row` (C,) int32, -1 = empty, C a power of two; `row_key` (R,) int64; `n` rows in use; `columns`, each (R, ...).
     """
 
-    def __init__(self, **columns: tuple[tuple[int, ...], np.dtype, float]) -> None:
+    def __init__(self, **columns: tuple[tuple[int, ...], type[np.generic], float]) -> None:
         """Declare columns as name=(shape of a row, dtype, value of a new row)."""
         self._new = columns
         self.n = 0

@@ -33,7 +33,7 @@ def paper_plane(patches: Patches, up: np.ndarray, *, settings: GroundConfig, rng
         plane = _plane_through(xyz[rng.integers(first[chosen], last[chosen])])
         if plane is None:
             continue
-        count = np.count_nonzero(np.abs(xyz @ plane[:3] + plane[3]) < settings.distance)
+        count = int(np.count_nonzero(np.abs(xyz @ plane[:3] + plane[3]) < settings.distance))
         if count > best_count:
             best, best_count = plane, count
     if best is None or best_count < 3:

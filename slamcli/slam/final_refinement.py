@@ -108,7 +108,7 @@ class _Look:
         self.T_wc[has_pose] = builder.kf.T_wk[tracks.ref_kf[has_pose]] @ tracks.T_kc[has_pose]
         self.ref_kf, self.T_kc = tracks.ref_kf.copy(), tracks.T_kc.copy()
         self.state, self.n_inliers = tracks.state.copy(), tracks.n_inliers.copy()
-        self._around: dict[int, tuple] = {}
+        self._around: dict[int, guided_matching.Candidates] = {}
 
     def at(self, i: int, T_wc: np.ndarray, kf: int, *, widening: float = 1.0, least: int = 0) -> bool:
         """Look for frame `i` at `T_wc` among the landmarks around key frame `kf`; False, and nothing changes, if it is not there.

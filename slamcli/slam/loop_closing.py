@@ -134,7 +134,6 @@ def _look_again(
     neighbours, _ = builder.covisible(candidate.kf_j)
     ids = builder.landmarks_in(np.append(neighbours[: settings.neighbours], candidate.kf_j))
     landmarks = builder.candidates(ids)
-    estimate = None
     for radius in (4.0, 2.0):
         feature, _ = guided_matching.search(
             T_iw,

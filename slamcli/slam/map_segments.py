@@ -94,6 +94,7 @@ def _between(builder: MapBuilder, closures: list[Candidate], a: int, b: int) -> 
 
 def _turned(c: Candidate) -> Candidate:
     """Give a closure as seen from its other key frame."""
+    assert c.T_ij is not None, "an accepted closure has a pose"
     return replace(c, kf_i=c.kf_j, kf_j=c.kf_i, T_ij=se3.inverse(c.T_ij))
 
 

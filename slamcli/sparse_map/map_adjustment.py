@@ -7,6 +7,7 @@ import numpy as np
 from slamcli.config.options import SensorConfig
 from slamcli.depth import noise_model
 from slamcli.estimation import bundle_adjustment
+from slamcli.estimation.bundle_adjustment import Observations
 from slamcli.estimation.relative_pose_factors import Edges
 from slamcli.geometry import se3
 from slamcli.geometry.camera import Camera
@@ -44,16 +45,9 @@ class Part:
     is_fixed: np.ndarray  # (K,) bool
     ids: np.ndarray  # (L,) landmarks seen more than once
     singles: np.ndarray  # landmarks seen once: they bear on nothing and go along with their key frame
-    obs_kf: np.ndarray  # (O,) index into kfs
-    obs_lm: np.ndarray  # (O,) index into ids, increasing
-    row: np.ndarray  # (O,) feature row
-    measured: Measurements
+    row: np.ndarray  # (O,) feature row of each observation
+    seen: Observations  # by index into kfs and ids
     edges: Edges  # between key frames of kfs
-
-    @property
-    def arguments(self) -> tuple:
-        """Give what `bundle.adjust` and `bundle.Problem` take between the landmarks and the camera."""
-        return self.obs_kf, self.obs_lm, self.measured.xy, self.measured.depth, self.measured.sigma_px, self.measured.sigma_z
 
 
 def gather(builder: MapBuilder, moving: np.ndarray, sensor: SensorConfig) -> Part:
@@ -72,7 +66,9 @@ def gather(builder: MapBuilder, moving: np.ndarray, sensor: SensorConfig) -> Par
     kf_index = np.searchsorted(kfs, obs_kf).astype(np.int32)
     is_inside = np.isin(builder.edge.kf, kfs).all(axis=1) & np.isin(builder.edge.kf, moving).any(axis=1)
     edges = Edges(np.searchsorted(kfs, builder.edge.kf[is_inside]), builder.edge.T_ij[is_inside], builder.edge.information[is_inside])
-    return Part(kfs, is_fixed, shared, ids[is_single], kf_index, obs_lm, row, measure(builder.features, row, sensor), edges)
+    measured = measure(builder.features, row, sensor)
+    seen = Observations(kf_index, obs_lm, measured.xy, measured.depth, measured.sigma_px, measured.sigma_z)
+    return Part(kfs, is_fixed, shared, ids[is_single], row, seen, edges)
 
 
 def adjust(
@@ -89,7 +85,7 @@ def adjust(
     result = bundle_adjustment.adjust(
         builder.T_kw(part.kfs),
         builder.lm.xyz[part.ids],
-        *part.arguments,
+        part.seen,
         camera,
         is_fixed=part.is_fixed,
         edges=replace(part.edges, information=edge_weight * part.edges.information),

@@ -8,23 +8,22 @@ from typing import Any
 import numpy as np
 
 from slamcli.artifacts import save
-from slamcli.calibration import rolling_shutter
-from slamcli.config.options import DensifyConfig, SensorConfig
+from slamcli.config.options import Config, DensifyConfig, SensorConfig
+from slamcli.datasets import Dataset
 from slamcli.dense import voxel_cloud
 from slamcli.depth import oriented_points
-from slamcli.errors import BadFrame
 from slamcli.formats.cloud import write_ply, write_ply_mesh
 from slamcli.geometry.camera import Camera
 from slamcli.navigation import floor
-from slamcli.parallel import ordered_map
-from slamcli.schema import Features, Map, Timing, Tracks, frame_poses
+from slamcli.stages.contract import Inputs, Summary, Tools
+from slamcli.stages.depth_frames import PosedFrame, depth_poses, read_depth
 
 SAMPLES_APART = 0.75  # voxels from sample to sample of a near surface: denser ones gain nothing
 FIRST_CAMERA = np.eye(4)  # the world is its frame; the level frame's origin is below it
 GROUND_FRAMES = 40  # key frames, evenly spread, that are searched for the floor; more do not move it
 
 
-def run(inputs: Any, out: Path, cfg: Any, tools: Any) -> dict:
+def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
     """Find the floor, join the key frames' depth, write `cloud.ply` (and `mesh.ply` where a surface was made) in the floor's frame."""
     camera, option = inputs.camera("loop"), cfg.densify
     poses = depth_poses(inputs)
@@ -72,21 +71,6 @@ def _model(camera: Camera, option: DensifyConfig) -> Any:
     return voxel_cloud.VoxelCloud(option.voxel)
 
 
-def depth_poses(inputs: Any, *, frames: str = "key") -> list[tuple[int, np.ndarray]]:
-    """Give frames' numbers and where the camera was, in the world frame, when their depth was measured; of map segment 0 alone.
-
-    inputs : what a stage gets, or a RunDir
-    frames : "key" frames, or "all" that have a pose
-    """
-    features, map_, when = inputs.load(Features, "extract"), inputs.load(Map, "loop"), inputs.load(Timing, "loop")
-    T_wc = frame_poses(inputs.load(Tracks, "loop"), map_)
-    is_main = map_.kf_segment == 0
-    T_wc[map_.kf_frame[is_main]] = map_.T_wk[is_main]
-    T_wd = rolling_shutter.depth_poses(features.stamp, features.depth_stamp + float(when.depth_delay), T_wc)
-    chosen = map_.kf_frame[is_main] if frames == "key" else np.flatnonzero(np.isfinite(T_wd[:, 0, 0]))
-    return [(int(frame), T_wd[frame]) for frame in chosen]
-
-
 @dataclass(frozen=True)
 class View:
     """What one key frame sees."""
@@ -98,9 +82,9 @@ class View:
 
 
 def views(
-    dataset: Any,
+    dataset: Dataset,
     camera: Camera,
-    poses: Iterable[tuple[int, np.ndarray]],
+    poses: Iterable[PosedFrame],
     sensor: SensorConfig,
     option: DensifyConfig,
     *,
@@ -110,24 +94,16 @@ def views(
     """Read and clean frames, in order; one without depth, or that cannot be read, gives no view."""
     is_volume = option.method == "tsdf"
 
-    def view(item: tuple[int, np.ndarray]) -> View | None:
-        frame, T_wk = item
-        try:
-            depth = dataset.depth(frame, camera)
-            if depth is None:
-                return None
-            seen = oriented_points.surface(
-                depth,
-                camera,
-                settings=option,
-                stride=1 if is_volume else option.stride,
-                spacing=0.0 if is_volume else SAMPLES_APART * option.voxel,
-                depth_min=sensor.depth_min,
-                depth_max=min(sensor.depth_max, option.depth_max),
-            )
-            return View(T_wk, depth, seen, dataset.rgb(frame))
-        except BadFrame as error:
-            warn(str(error))
-            return None
+    def look(frame: int, depth: np.ndarray, T_wk: np.ndarray) -> View:
+        seen = oriented_points.surface(
+            depth,
+            camera,
+            settings=option,
+            stride=1 if is_volume else option.stride,
+            spacing=0.0 if is_volume else SAMPLES_APART * option.voxel,
+            depth_min=sensor.depth_min,
+            depth_max=min(sensor.depth_max, option.depth_max),
+        )
+        return View(T_wk, depth, seen, dataset.rgb(frame))
 
-    return (found for found in ordered_map(view, poses, workers=workers) if found is not None)
+    return read_depth(dataset, camera, poses, look, workers=workers, warn=warn)

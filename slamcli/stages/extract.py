@@ -1,6 +1,5 @@
 """extract: images -> ORB features with depth."""
 
-import json
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -8,13 +7,15 @@ from pathlib import Path
 import numpy as np
 
 from slamcli import artifacts
-from slamcli.config.options import ExtractConfig
+from slamcli.config.options import Config, ExtractConfig
 from slamcli.datasets import Dataset
 from slamcli.depth import at_key_points, icp
 from slamcli.errors import BadFrame, SlamError
 from slamcli.geometry.camera import Camera
 from slamcli.parallel import ordered_map
 from slamcli.schema import CoarseDepth, Features, Flow
+from slamcli.stages.contract import Inputs, Summary, Tools
+from slamcli.stages.map_outputs import write_camera
 from slamcli.vision import optical_flow, orb
 
 
@@ -29,7 +30,7 @@ class _Frame:
     faults: list[str]  # why an image could not be used
 
 
-def run(inputs, out: Path, cfg, tools) -> dict:
+def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
     """Detect ORB features in every colour frame and read their depth."""
     dataset, camera = inputs.dataset, inputs.dataset.camera
     frames = ordered_map(partial(_extract, dataset, cfg.extract), range(len(dataset)), workers=tools.workers)
@@ -101,11 +102,6 @@ def detect(grey: np.ndarray, settings: ExtractConfig) -> orb.KeyPoints:
     )
 
 
-def write_camera(out: Path, camera: Camera) -> None:
-    """Write `camera.json`: the recording's calibration, and in later stages what is known of the camera by then."""
-    (out / "camera.json").write_text(json.dumps(camera.to_dict(), indent=2) + "\n")
-
-
 def _table(dataset: Dataset, camera: Camera, found: list[_Frame], scale: float) -> Features:
     points = [frame.points for frame in found]
     raw = np.concatenate([p.xy for p in points])
@@ -119,7 +115,7 @@ def _table(dataset: Dataset, camera: Camera, found: list[_Frame], scale: float) 
         octave=np.concatenate([p.octave for p in points]),
         angle=np.concatenate([p.angle for p in points]),
         desc=np.concatenate([p.desc for p in points]),
-        octave_scale=np.float64(scale),
+        octave_scale=np.array(scale),
     )
 
 
@@ -131,7 +127,7 @@ def _coarse_table(camera: Camera, found: list[_Frame]) -> CoarseDepth:
     return CoarseDepth(coarse_depth=coarse)
 
 
-def _flow_table(dataset: Dataset, camera: Camera, found: list[_Frame], tools) -> Flow:
+def _flow_table(dataset: Dataset, camera: Camera, found: list[_Frame], tools: Tools) -> Flow:
     """Follow the key points of every frame into the next one."""
 
     def follow(i: int) -> np.ndarray:

@@ -6,16 +6,16 @@ from typing import Any
 import numpy as np
 
 from slamcli.artifacts import save
-from slamcli.errors import BadFrame
+from slamcli.config.options import Config
 from slamcli.formats import grid_map, octomap
 from slamcli.navigation import grid
 from slamcli.navigation.grid_evidence import View, look
-from slamcli.parallel import ordered_map
 from slamcli.schema import Features, Grid, Ground
-from slamcli.stages.densify import depth_poses
+from slamcli.stages.contract import Inputs, Summary, Tools
+from slamcli.stages.depth_frames import depth_poses, read_depth
 
 
-def run(inputs: Any, out: Path, cfg: Any, tools: Any) -> dict:
+def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
     """Write map.pgm, map.yaml and the Grid before the decision rule."""
     grid.check(cfg.grid2d)
     ground = inputs.load(Ground, "densify")
@@ -32,27 +32,21 @@ def run(inputs: Any, out: Path, cfg: Any, tools: Any) -> dict:
     if not counts["free"]:
         tools.warn("the grid has no free cell: the floor was not seen")
     save(made, out)
-    grid_map.write(out / "map.pgm", grid_map.GridMap(made.state, tuple(made.origin.tolist()), float(made.resolution)))
+    grid_map.write(out / "map.pgm", grid_map.GridMap(made.state, (float(made.origin[0]), float(made.origin[1])), float(made.resolution)))
     rows, columns = made.state.shape
     return {**summary, "columns": columns, "rows": rows, **counts, "floor": bool(ground.is_found)}
 
 
-def _from_depth(inputs: Any, T_lw: np.ndarray, cfg: Any, tools: Any) -> tuple[Grid, int]:
+def _from_depth(inputs: Inputs, T_lw: np.ndarray, cfg: Config, tools: Tools) -> tuple[Grid, int]:
     option, camera = cfg.grid2d, inputs.camera("loop")
     rays = np.ascontiguousarray(camera.rays)
     has_depth = np.isfinite(inputs.load(Features, "extract").depth_stamp)
     poses = [(frame, T_lw @ T_wd) for frame, T_wd in depth_poses(inputs, frames="all") if has_depth[frame]]
     chosen = grid.spaced(np.array([T_ld for _, T_ld in poses]).reshape(-1, 4, 4), metres=option.spacing, degrees=option.spacing_deg)
 
-    def view(row: int) -> View | None:
-        frame, T_ld = poses[row]
-        try:
-            depth = inputs.dataset.depth(frame, camera)
-        except BadFrame as error:
-            tools.warn(str(error))
-            return None
-        return None if depth is None else look(depth, rays, T_ld, settings=option, sensor=cfg.sensor)
+    def look_at(frame: int, depth: np.ndarray, T_ld: np.ndarray) -> View:
+        return look(depth, rays, T_ld, settings=option, sensor=cfg.sensor)
 
-    found = ordered_map(view, tools.progress(chosen.tolist(), "grid2d"), workers=tools.workers)
-    views = [one for one in found if one is not None]
+    spaced = tools.progress([poses[row] for row in chosen.tolist()], "grid2d")
+    views = list(read_depth(inputs.dataset, camera, spaced, look_at, workers=tools.workers, warn=tools.warn))
     return grid.fuse(views, settings=option), len(views)

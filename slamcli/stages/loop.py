@@ -9,8 +9,10 @@ import numpy as np
 from slamcli import artifacts
 from slamcli.calibration import self_calibration
 from slamcli.calibration.self_calibration import Sensing
+from slamcli.config.options import Config
 from slamcli.errors import SlamError
 from slamcli.formats.g2o import write_g2o
+from slamcli.geometry.camera import Camera
 from slamcli.schema import LOST, Closures, CoarseDepth, Features, Map, Timing, Tracks, Words
 from slamcli.slam import final_refinement, loop_closing, map_segments
 from slamcli.slam.depth_tracking import Reliefs
@@ -18,11 +20,11 @@ from slamcli.slam.loop_closing import Candidate
 from slamcli.slam.place_recognition import PlaceIndex
 from slamcli.sparse_map import map_adjustment
 from slamcli.sparse_map.sparse_map import MapBuilder
-from slamcli.stages.extract import write_camera
-from slamcli.stages.track import save_map_stage, segment_file, segments_apart
+from slamcli.stages.contract import Inputs, Summary, Tools
+from slamcli.stages.map_outputs import describe_other_segments, save_map, segment_file, write_camera
 
 
-def run(inputs, out: Path, cfg, tools) -> dict:
+def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
     """Join map segments and close loops until no new one appears; then look at all key frames and frames again."""
     words, tracks = inputs.load(Words, "match"), inputs.load(Tracks, "optimize")
     when, camera = inputs.load(Timing, "optimize"), inputs.camera("optimize")
@@ -49,10 +51,9 @@ def run(inputs, out: Path, cfg, tools) -> dict:
     map_ = map_segments.anchored(main_first(builder.snapshot(), tracks, cfg.loop.main_segment), tracks)
     write_pose_graph(out / "posegraph.g2o", map_.T_wk, loop_closing.build_pose_graph(builder, accepted, cfg.loop))
     write_candidates(out / "candidates.csv", tried)
-    for segment, told in enumerate(segments_apart(tracks, map_), start=1):
+    for segment, told in enumerate(describe_other_segments(tracks, map_), start=1):
         tools.warn(f"{told}, could not be joined: their poses, in a frame of their own, are in {segment_file(segment)}; no map shows them")
-    save_map_stage(out, features.stamp, tracks, map_)
-    artifacts.save(tracks, out)
+    save_map(out, features.stamp, tracks, map_)
     artifacts.save(when, out)
     write_camera(out, camera)
     artifacts.save(closures_of(accepted), out)
@@ -75,7 +76,7 @@ def main_first(map_: Map, tracks: Tracks, main: int) -> Map:
     return map_segments.ranked(map_, tracks, main)
 
 
-def close_loops(builder: MapBuilder, words: Words, camera, cfg, tools) -> list[Candidate]:
+def close_loops(builder: MapBuilder, words: Words, camera: Camera, cfg: Config, tools: Tools) -> list[Candidate]:
     """Search, verify, correct, fuse, adjust; again while that brings new closures. Returns all candidates with their fate."""
     places = PlaceIndex(words, builder.kf.frame)
     rng = tools.rng()
@@ -108,7 +109,7 @@ def close_loops(builder: MapBuilder, words: Words, camera, cfg, tools) -> list[C
     return [fate[key] for key in sorted(fate)]
 
 
-def settle(builder: MapBuilder, closures: list[Candidate], camera, cfg) -> None:
+def settle(builder: MapBuilder, closures: list[Candidate], camera: Camera, cfg: Config) -> None:
     """Fuse what both sides of the closures see, and adjust the whole map."""
     for c in closures:
         loop_closing.fuse_around(builder, c, camera, cfg.loop, cfg.sensor)
@@ -122,7 +123,9 @@ def are_apart(builder: MapBuilder, c: Candidate) -> bool:
     return bool(builder.kf.segment[c.kf_i] != builder.kf.segment[c.kf_j])
 
 
-def join_segments(builder: MapBuilder, places, camera, cfg, rng) -> dict[tuple[int, int], Candidate]:
+def join_segments(
+    builder: MapBuilder, places: PlaceIndex, camera: Camera, cfg: Config, rng: np.random.Generator
+) -> dict[tuple[int, int], Candidate]:
     """Join map segments that saw the same place. Returns the fate of candidates between segments, by pair of key frames."""
     if len(np.unique(builder.kf.segment)) < 2:
         return {}

@@ -2,17 +2,19 @@
 
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from slamcli import artifacts
-from slamcli.config.options import MatchConfig
+from slamcli.config.options import Config, MatchConfig
 from slamcli.parallel import ordered_map
 from slamcli.schema import Features, Flow, Matches, Words
+from slamcli.stages.contract import Inputs, Summary, Tools
 from slamcli.vision import hamming, optical_flow, vocabulary
 
 
-def run(inputs, out: Path, cfg, tools) -> dict:
+def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
     """Quantise every feature, make the frames' word vectors, match each frame to those before it."""
     features, settings = inputs.load(Features, "extract"), cfg.match
     words = _words(features, vocabulary.load(settings.vocabulary), settings)
@@ -59,7 +61,7 @@ def _match(
 
 def _match_descriptors(features: Features, words: Words, settings: MatchConfig, pair: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
     i, j = (slice(int(features.offset[frame]), int(features.offset[frame + 1])) for frame in pair)
-    checks = {"max_distance": settings.max_distance, "ratio": settings.ratio, "check_rotation": settings.check_rotation}
+    checks: Any = {"max_distance": settings.max_distance, "ratio": settings.ratio, "check_rotation": settings.check_rotation}
     if settings.method == "brute":
         return hamming.match_brute(features.desc[i], features.desc[j], features.angle[i], features.angle[j], **checks)
     return hamming.match_nodes(

@@ -2,27 +2,26 @@
 
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from slamcli.config.options import OctreeConfig, SensorConfig
+from slamcli.config.options import Config, OctreeConfig, SensorConfig
+from slamcli.datasets import Dataset
 from slamcli.dense import change_detection
 from slamcli.dense.occupancy import OccupancyMap, Scan
 from slamcli.depth import oriented_points
-from slamcli.errors import BadFrame
 from slamcli.formats import octomap
 from slamcli.geometry import octree, se3
 from slamcli.geometry.camera import Camera
-from slamcli.parallel import ordered_map
 from slamcli.schema import Ground
-from slamcli.stages.densify import depth_poses
+from slamcli.stages.contract import Inputs, Summary, Tools
+from slamcli.stages.depth_frames import PosedFrame, depth_poses, read_depth
 
 RAYS_APART = 0.3  # cells from end point to end point on a near surface
 ROUNDS = 2  # of asking the frames between: something may stand before what the first were asked about
 
 
-def run(inputs: Any, out: Path, cfg: Any, tools: Any) -> dict:
+def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
     """Insert depth images as scans, write `map.ot` and `map.bt`."""
     option = cfg.octree
     grid = OccupancyMap(option.resolution, hit=option.hit, miss=option.miss, clamp_min=option.clamp_min, clamp_max=option.clamp_max)
@@ -49,7 +48,7 @@ def run(inputs: Any, out: Path, cfg: Any, tools: Any) -> dict:
     }
 
 
-def rounds(inputs: Any, grid: OccupancyMap, option: OctreeConfig) -> Iterator[list[tuple[int, np.ndarray]]]:
+def rounds(inputs: Inputs, grid: OccupancyMap, option: OctreeConfig) -> Iterator[list[PosedFrame]]:
     """Give the frames to insert next, each with its pose (4, 4) camera to level frame, in the order of time; rounds follow on one another."""
     T_lw = inputs.load(Ground, "densify").T_lw
     poses = [(frame, T_lw @ T_wc) for frame, T_wc in depth_poses(inputs, frames="all")]
@@ -67,9 +66,9 @@ def rounds(inputs: Any, grid: OccupancyMap, option: OctreeConfig) -> Iterator[li
 
 
 def scans(
-    dataset: Any,
+    dataset: Dataset,
     camera: Camera,
-    poses: Iterable[tuple[int, np.ndarray]],
+    poses: Iterable[PosedFrame],
     sensor: SensorConfig,
     option: OctreeConfig,
     *,
@@ -81,15 +80,7 @@ def scans(
     poses : (frame, camera to that frame when its depth was measured); one without depth, or that cannot be read, gives no scan
     """
 
-    def scan(item: tuple[int, np.ndarray]) -> Scan | None:
-        frame, T_lk = item
-        try:
-            depth = dataset.depth(frame, camera)
-        except BadFrame as error:
-            warn(str(error))
-            return None
-        if depth is None:
-            return None
+    def look(frame: int, depth: np.ndarray, T_lk: np.ndarray) -> Scan:
         seen = oriented_points.surface(
             depth,
             camera,
@@ -101,4 +92,4 @@ def scans(
         )
         return Scan(se3.transform(T_lk, seen.xyz_c.astype(np.float64)), T_lk[:3, 3], frame)
 
-    return (item for item in ordered_map(scan, poses, workers=workers) if item is not None)
+    return read_depth(dataset, camera, poses, look, workers=workers, warn=warn)

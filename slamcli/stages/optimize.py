@@ -2,42 +2,43 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from slamcli import artifacts
 from slamcli.calibration import rolling_shutter, self_calibration
 from slamcli.calibration.self_calibration import Sensing
+from slamcli.config.options import Config
 from slamcli.schema import CoarseDepth, Features, Map, Timing, Tracks
 from slamcli.slam import final_refinement, map_segments
 from slamcli.slam.depth_tracking import NO_RELIEFS, Reliefs
 from slamcli.sparse_map import map_adjustment
 from slamcli.sparse_map.sparse_map import MapBuilder
-from slamcli.stages.extract import write_camera
-from slamcli.stages.track import save_map_stage
+from slamcli.stages.contract import Inputs, Summary, Tools
+from slamcli.stages.map_outputs import save_map, write_camera
 
 
-def run(inputs, out: Path, cfg, tools) -> dict:
+def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
     """Refine key frames, landmarks, what is not known of the camera, and frames, without closures."""
     features, tracks, map_ = inputs.load(Features, "extract"), inputs.load(Tracks, "track"), inputs.load(Map, "track")
     given = inputs.camera()
     delay = np.array(0.0 if cfg.optimize.move_depth else np.nan)
     still = Timing(np.array(0.0), np.array(0.0), depth_delay=delay, twist=rolling_shutter.frame_twists(features.stamp, tracks, map_))
-    sensing, summary = Sensing(given, still, {}), {}
+    sensing, summary = Sensing(given, still, {}), dict[str, Any]()
     if cfg.optimize.enabled and len(map_.kf_frame) > 1:
         builder = MapBuilder.from_map(features, map_)
         reliefs = Reliefs(inputs.load(CoarseDepth, "extract"), given, cfg.sensor)
         tracks, sensing, summary = refine(builder, features, tracks, sensing, cfg, tools, reliefs=reliefs)
         map_ = map_segments.anchored(builder.snapshot(), tracks)
-    save_map_stage(out, features.stamp, tracks, map_)
-    artifacts.save(tracks, out)
+    save_map(out, features.stamp, tracks, map_)
     artifacts.save(sensing.timing, out)
     write_camera(out, sensing.camera)
     return {"frames": len(features.stamp), "key_frames": len(map_.kf_frame)} | told(sensing) | summary
 
 
 def refine(
-    builder: MapBuilder, features: Features, tracks: Tracks, sensing: Sensing, cfg, tools, *, reliefs: Reliefs = NO_RELIEFS
+    builder: MapBuilder, features: Features, tracks: Tracks, sensing: Sensing, cfg: Config, tools: Tools, *, reliefs: Reliefs = NO_RELIEFS
 ) -> tuple[Tracks, Sensing, dict]:
     """Adjust the map, find what of the camera suits it, and again; returns tracks, what was found, and the evidence.
 

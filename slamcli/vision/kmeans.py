@@ -31,7 +31,7 @@ def _assign(desc, rows, centres, label):
     for k in range(len(rows)):
         nearest, least = 0, 257
         for c in range(len(centres)):
-            d = np.int32(hamming(desc, rows[k], centres, c))
+            d = int(hamming(desc, rows[k], centres, c))
             if d < least:
                 nearest, least = c, d
         changed += label[k] != nearest

@@ -17,12 +17,18 @@ def follow(grey: np.ndarray, following: np.ndarray, xy: np.ndarray) -> np.ndarra
     start = np.ascontiguousarray(xy, dtype=np.float32)
     if len(start) == 0:
         return start.reshape(0, 2)
-    there, is_found, _ = cv2.calcOpticalFlowPyrLK(grey, following, start, None, winSize=WINDOW, maxLevel=LEVELS)
-    back, is_back, _ = cv2.calcOpticalFlowPyrLK(following, grey, there, None, winSize=WINDOW, maxLevel=LEVELS)
+    there, is_found = _track(grey, following, start)
+    back, is_back = _track(following, grey, there)
     height, width = following.shape
     is_inside = ((there >= 0) & (there <= [width - 1, height - 1])).all(axis=1)
-    is_kept = (is_found[:, 0] > 0) & (is_back[:, 0] > 0) & is_inside & (np.linalg.norm(back - start, axis=1) < RETURN_PX)
+    is_kept = is_found & is_back & is_inside & (np.linalg.norm(back - start, axis=1) < RETURN_PX)
     return np.where(is_kept[:, None], there, np.float32(np.nan))
+
+
+def _track(grey: np.ndarray, following: np.ndarray, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Follow points by Lucas and Kanade's method in a pyramid; returns where they went and which were found."""
+    there, status, _ = cv2.calcOpticalFlowPyrLK(grey, following, xy, np.empty_like(xy), winSize=WINDOW, maxLevel=LEVELS)
+    return there, status[:, 0] > 0
 
 
 def match(xy_i: np.ndarray, flowed_j: np.ndarray, *, is_free_i: np.ndarray, is_free_j: np.ndarray, radius: float) -> np.ndarray:

@@ -190,7 +190,7 @@ def _descend(
         while first_child[here] < first_child[here + 1]:
             nearest, least, following, second = -1, 257, -1, 257
             for child in range(first_child[here], first_child[here + 1]):
-                d = np.int32(hamming(desc, k, centre, child))
+                d = int(hamming(desc, k, centre, child))
                 if d < least:
                     following, second = nearest, least
                     nearest, least = child, d

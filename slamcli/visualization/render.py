@@ -83,7 +83,7 @@ def draw_octree(tree: Octree, *, view: View, threshold: float = 0.0, path: np.nd
         middle = centre[faces[:, number]] + 0.5 * side * direction
         towards = ((eye.centre_l - middle) @ direction) > 0.0
         middle, colour = middle[towards], rgb[faces[:, number]][towards]
-        shade = 0.62 + 0.38 * max(0.0, float(direction @ LIGHT) / np.linalg.norm(LIGHT))
+        shade = 0.62 + 0.38 * max(0.0, float(direction @ LIGHT / np.linalg.norm(LIGHT)))
         u, v = np.roll(direction, 1) * 0.5 * side, np.roll(direction, 2) * 0.5 * side
         corners = np.stack([eye.see(middle + s * u + t * v) for s, t in ((-1, -1), (1, -1), (1, 1), (-1, 1))], axis=1)
         triangles = np.concatenate([corners[:, [0, 1, 2]], corners[:, [0, 2, 3]]])

@@ -7,6 +7,7 @@ import pytest
 from bundle_scene import CAMERA, LIMITS, drive, pose_error
 
 from slamcli.estimation import bundle_adjustment, bundle_kernels
+from slamcli.estimation.bundle_adjustment import Observations
 from slamcli.geometry import se3
 
 
@@ -80,9 +81,8 @@ def test_a_lost_landmark_and_one_behind_the_camera_do_not_spread():
 def test_empty_problems_come_back_as_they_went():
     nothing = np.zeros(0)
     T, x = np.eye(4)[None], np.zeros((0, 3))
-    result = bundle_adjustment.adjust(
-        T, x, nothing.astype(int), nothing.astype(int), np.zeros((0, 2)), nothing, nothing, nothing, CAMERA, is_fixed=np.array([False])
-    )  # fmt: skip
+    seen = Observations(nothing.astype(int), nothing.astype(int), np.zeros((0, 2)), nothing, nothing, nothing)
+    result = bundle_adjustment.adjust(T, x, seen, CAMERA, is_fixed=np.array([False]))
     assert (result.T_cw == T).all() and result.cost == [0.0] and result.is_converged
     scene = drive(3, 30)
     only_landmarks = bundle_adjustment.adjust(*scene.problem, is_fixed=np.ones(3, dtype=bool))

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from slamcli.estimation import camera_pose, minimal_solvers, pose_kernels
+from slamcli.estimation.bundle_adjustment import Observations
 from slamcli.geometry import se3
 from slamcli.geometry.camera import Camera
 
@@ -183,7 +184,7 @@ def test_normal_equations_equal_numerical_derivatives():
     cost = pose_kernels.normal_equations(
         T, x_w, xy, depth, 1 / sigma_px, 1 / sigma_z, np.ones(40, dtype=bool), intrinsics, *LIMITS, True, chi2, H, b
     )  # fmt: skip
-    one = (T[None], x_w, np.zeros(40, dtype=int), np.arange(40), xy, depth, sigma_px, sigma_z, CAMERA, LIMITS)
+    one = (T[None], x_w, Observations(np.zeros(40, dtype=int), np.arange(40), xy, depth, sigma_px, sigma_z), CAMERA, LIMITS)
     H_slow, b_slow = naive.bundle_normal_equations(*one)
     np.testing.assert_allclose(cost, naive.bundle_cost(*one), rtol=1e-12)
     np.testing.assert_allclose(np.triu(H), np.triu(H_slow[:6, :6]), rtol=1e-5, atol=1e-5 * np.abs(H).max())
@@ -234,7 +235,7 @@ def test_without_the_kernel_it_is_least_squares():
     T_cw, x_w, xy, depth, sigma_px, sigma_z, _ = view(np.random.default_rng(20), 30)
     everything = {"chi2_px": np.inf, "chi2_depth": np.inf, "rounds": 1}
     found = camera_pose.refine_pose(T_cw, x_w, xy, depth, sigma_px, sigma_z, CAMERA, huber=False, **everything)
-    one = (x_w, np.zeros(30, dtype=int), np.arange(30), xy, depth, sigma_px, sigma_z, CAMERA)
+    one = (x_w, Observations(np.zeros(30, dtype=int), np.arange(30), xy, depth, sigma_px, sigma_z), CAMERA)
     best = naive.bundle_cost(found.T_cw[None], *one)
     np.testing.assert_allclose(found.cost, best, rtol=1e-9)
     for step in np.concatenate([np.eye(6), -np.eye(6)]) * 1e-5:

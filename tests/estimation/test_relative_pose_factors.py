@@ -7,6 +7,7 @@ import pytest
 from bundle_scene import CAMERA, drive, pose_error
 
 from slamcli.estimation import bundle_adjustment
+from slamcli.estimation.bundle_adjustment import Observations
 from slamcli.estimation.relative_pose_factors import CHI2_95_6DOF, Edges, EdgeTerms, residuals
 from slamcli.geometry import se3
 
@@ -26,7 +27,8 @@ def chain(T_true: np.ndarray, rng: np.random.Generator, *, noise: float = 1.0, r
 def blank(T_cw: np.ndarray) -> tuple:
     """Give a bundle problem without any landmark."""
     nothing = np.empty(0)
-    return T_cw, np.empty((0, 3)), nothing.astype(int), nothing.astype(int), np.empty((0, 2)), nothing, nothing, nothing, CAMERA
+    seen = Observations(nothing.astype(int), nothing.astype(int), np.empty((0, 2)), nothing, nothing, nothing)
+    return T_cw, np.empty((0, 3)), seen, CAMERA
 
 
 def numerical_gradient(terms: EdgeTerms, T_cw: np.ndarray, robust: bool, step: float = 1e-6) -> np.ndarray:

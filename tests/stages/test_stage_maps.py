@@ -20,6 +20,7 @@ from slamcli.formats import cloud, octomap
 from slamcli.geometry import se3
 from slamcli.schema import Features, Ground, Map, Timing, Tracks
 from slamcli.stages import densify, octree
+from slamcli.stages.depth_frames import depth_poses
 
 SETTINGS = {"seed": 1, "frames": 220, "laps": 2.0, "width": 160, "height": 120, "movable": True}
 CFG = Config(
@@ -163,7 +164,7 @@ def test_the_floor_is_level_and_at_zero(done: Done) -> None:
 def test_the_octree_agrees_with_the_images_it_was_made_from(done: Done) -> None:
     tree = octomap.read(done.folder / "octree" / "map.ot")
     T_lw = artifacts.load(Ground, done.folder / "densify").T_lw
-    poses = [(frame, T_lw @ T_wk) for frame, T_wk in densify.depth_poses(done.inputs)]
+    poses = [(frame, T_lw @ T_wk) for frame, T_wk in depth_poses(done.inputs)]
     scans = octree.scans(done.inputs.dataset, done.inputs.camera(), poses, CFG.sensor, CFG.octree)
     result = occupancy.accuracy(tree, scans, max_range=CFG.octree.max_range)
     assert 0.97 < result.share < 1.0
@@ -173,11 +174,11 @@ def test_the_octree_agrees_with_the_images_it_was_made_from(done: Done) -> None:
 def test_the_depth_delay_that_optimize_found_is_taken_out_of_the_poses(recording: Path, tmp_path: Path) -> None:
     on_time, delayed = Inputs(recording, tmp_path), Inputs(recording, tmp_path)
     delayed.delay_depth(0.02)
-    for (frame, T_wd), (same_frame, T_wd_delayed) in zip(densify.depth_poses(on_time), densify.depth_poses(delayed), strict=True):
+    for (frame, T_wd), (same_frame, T_wd_delayed) in zip(depth_poses(on_time), depth_poses(delayed), strict=True):
         assert frame == same_frame
         np.testing.assert_allclose(T_wd_delayed, T_wd, atol=1e-12)
     delayed._records[Timing] = on_time._records[Timing]
-    moved = [np.abs(a - b).max() for (_, a), (_, b) in zip(densify.depth_poses(on_time), densify.depth_poses(delayed), strict=True)]
+    moved = [np.abs(a - b).max() for (_, a), (_, b) in zip(depth_poses(on_time), depth_poses(delayed), strict=True)]
     assert np.median(moved) > 1e-4
 
 

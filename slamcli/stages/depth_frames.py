@@ -1,0 +1,57 @@
+"""Depth images with the poses of the camera that took them: what densify, octree and grid2d are made from."""
+
+from collections.abc import Callable, Iterable, Iterator
+from typing import TypeVar
+
+import numpy as np
+
+from slamcli.calibration import rolling_shutter
+from slamcli.datasets import Dataset
+from slamcli.errors import BadFrame
+from slamcli.geometry.camera import Camera
+from slamcli.parallel import ordered_map
+from slamcli.schema import Features, Map, Timing, Tracks, frame_poses
+from slamcli.stages.contract import Stored
+
+Seen = TypeVar("Seen")
+PosedFrame = tuple[int, np.ndarray]  # a frame's number, and its pose (4, 4), camera to some frame, when its depth was measured
+
+
+def depth_poses(inputs: Stored, *, frames: str = "key") -> list[PosedFrame]:
+    """List frames of the main map segment with the pose of the camera, in the world, when their depth was measured.
+
+    frames : "key" frames, or "all" that have a pose
+    """
+    features, map_, when = inputs.load(Features, "extract"), inputs.load(Map, "loop"), inputs.load(Timing, "loop")
+    T_wc = frame_poses(inputs.load(Tracks, "loop"), map_)
+    is_main = map_.kf_segment == 0
+    T_wc[map_.kf_frame[is_main]] = map_.T_wk[is_main]
+    T_wd = rolling_shutter.depth_poses(features.stamp, features.depth_stamp + float(when.depth_delay), T_wc)
+    chosen = map_.kf_frame[is_main] if frames == "key" else np.flatnonzero(np.isfinite(T_wd[:, 0, 0]))
+    return [(int(frame), T_wd[frame]) for frame in chosen]
+
+
+def read_depth(
+    dataset: Dataset,
+    camera: Camera,
+    poses: Iterable[PosedFrame],
+    look: Callable[[int, np.ndarray, np.ndarray], Seen],
+    *,
+    workers: int = 1,
+    warn: Callable[[str], None] = lambda message: None,
+) -> Iterator[Seen]:
+    """Read frames' depth images, in order, and hand each to `look(frame, depth, pose)` in a worker thread; yields what that returns.
+
+    depth : (H, W) float32 [m], NaN = none. A frame without depth, or that cannot be read, yields nothing; `warn` is told of the latter.
+    """
+
+    def seen(posed: PosedFrame) -> Seen | None:
+        frame, pose = posed
+        try:
+            depth = dataset.depth(frame, camera)
+            return None if depth is None else look(frame, depth, pose)
+        except BadFrame as error:
+            warn(str(error))
+            return None
+
+    return (found for found in ordered_map(seen, poses, workers=workers) if found is not None)
