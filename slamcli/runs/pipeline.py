@@ -16,7 +16,7 @@ from slamcli.console import Progress, Tell, silent, stage_line
 from slamcli.errors import SlamError
 from slamcli.jit import compilation
 from slamcli.parallel import one_thread_in_blas
-from slamcli.runs import run_directory, staleness
+from slamcli.runs import run_directory, source_code, staleness
 from slamcli.runs.cost_meter import Meter
 from slamcli.runs.run_directory import RunDir
 from slamcli.runs.staleness import State
@@ -231,14 +231,15 @@ class Pipeline:
         tools: Tools,
         summary: Mapping[str, Any],
     ) -> dict[str, Any]:
-        declared = staleness.declared(stage, self.config)
+        declared, code = staleness.declared(stage, self.config), source_code.of_stage(stage.name)
         frames = summary.get("frames")
         return {
             "format": FORMAT,
             "stage": stage.name,
-            "key": staleness.key(declared, inputs),
+            "key": staleness.key(declared, inputs, code),
             "config": declared,
             "inputs": dict(inputs),
+            "code": dict(code),
             "outputs": outputs,
             "digest": staleness.digest({name: entry["sha256"] for name, entry in outputs.items()}),
             "environment": environment(),
