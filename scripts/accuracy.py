@@ -17,7 +17,6 @@ import itertools
 import json
 import os
 import shutil
-import subprocess
 import sys
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -26,6 +25,7 @@ import numpy as np
 import rewritten
 import rivals
 
+import slamcli
 from slamcli.config import toml
 from slamcli.config.options import Config
 from slamcli.console import table
@@ -95,13 +95,10 @@ def measured(recording: str, given: argparse.Namespace) -> list[Result]:
 
 
 def features_of(recording: str, offset: int, every: int, assignments: list[str], out: Path) -> RunDir:
-    """Detect and match features of every n-th frame from a start frame on, in a process of its own."""
+    """Detect and match features of every n-th frame from a start frame on."""
     folder = out / f"{Path(recording).name}-{offset}-{every}"
     thinned = rewritten.write(folder / "recording", rewritten.thinned(rewritten.listed(recording), offset, every))
-    arguments = [word for text in assignments for word in ("-s", text)]
-    command = [sys.executable, "-m", "slamcli", "run", str(thinned), "-r", str(folder / "features"), "--until", "match", *arguments]
-    subprocess.run(command, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    return RunDir.find(str(folder / "features"))
+    return slamcli.run(thinned, path=folder / "features", settings=assignments, until="match").directory
 
 
 def variant(source: RunDir, folder: Path, config: Config) -> RunDir:

@@ -17,7 +17,6 @@ session. --compare FILE warns where that multiple has grown by more than a tenth
 import argparse
 import json
 import os
-import subprocess
 import sys
 import tempfile
 import time
@@ -25,6 +24,7 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import own_process
 import published
 import rivals
 
@@ -89,8 +89,7 @@ def cpu_ms(records: list[dict[str, Any]], n_frames: int) -> float:
 
 def measure(recording: str, given: argparse.Namespace, folder: Path) -> dict[str, Any]:
     """Run everything on a recording and give its figures."""
-    subprocess.run([sys.executable, "-m", "slamcli", "run", recording, "-r", str(folder)], check=True, stdout=subprocess.DEVNULL)
-    run = RunDir.find(str(folder))
+    run = own_process.run(recording, path=folder).directory
     yardstick = plain_orb_ms(run)
     systems = {OURS: ours(run)}
     if given.orbslam3:
@@ -259,7 +258,7 @@ def main() -> None:
         if given.compare:
             for line in slower(found, json.loads(given.compare.read_text(encoding="utf-8"))):
                 print(f"warning: {line}", file=sys.stderr)
-    except (SlamError, subprocess.CalledProcessError) as error:
+    except SlamError as error:
         sys.exit(f"Error: {error}")
 
 

@@ -9,17 +9,19 @@ run's over the same frames. OUT keeps the recordings (lists, with links to the i
 """
 
 import argparse
-import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import rewritten
 
+import slamcli
+from slamcli import console
 from slamcli.console import table
+from slamcli.datasets import open_dataset
 from slamcli.errors import SlamError
 from slamcli.evaluation import trajectory_error
-from slamcli.formats.trajectory import read_tum
+from slamcli.runs.localization import localise
 from slamcli.runs.run_directory import RunDir
 from slamcli.schema import Trajectory
 
@@ -63,21 +65,15 @@ def half_in_half(lists: rewritten.Listed, reference: Trajectory, out: Path) -> l
     middle = 0.5 * (lists.colour[-1][0] - lists.start)
     run = run_of(rewritten.write(out / "first_half", rewritten.between(lists, 0.0, middle)), out)
     second = rewritten.between(lists, middle, np.inf)
-    recording, found = rewritten.write(out / "second_half", second), out / "second_half.txt"
-    slamcli("localize", str(run.path), str(recording), "--out", str(found))
-    return row("second half in first", second, 0, 1, read_tum(found), reference)
+    recording = rewritten.write(out / "second_half", second)
+    found = localise(run, open_dataset(str(recording)), progress=console.progress)
+    return row("second half in first", second, 0, 1, found.trajectory, reference)
 
 
 def run_of(recording: Path, out: Path) -> RunDir:
     """Bring the run of a recording up to date, as far as the trajectory goes."""
     folder = out / f"{recording.name}.run"
-    slamcli("run", str(recording), "-r", str(folder), "--until", "loop")
-    return RunDir.find(str(folder))
-
-
-def slamcli(*arguments: str) -> None:
-    """Give a command."""
-    subprocess.run([sys.executable, "-m", "slamcli", *arguments], check=True, stdout=subprocess.DEVNULL)
+    return slamcli.run(recording, path=folder, until="loop", progress=console.progress, tell=console.say).directory
 
 
 def row(name: str, lists: rewritten.Listed, n_black: int, n_segments: int, found: Trajectory, reference: Trajectory) -> list[str]:

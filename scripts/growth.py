@@ -9,10 +9,10 @@ the peak memory of both; compiling is left out. OUT keeps recordings (lists, wit
 """
 
 import argparse
-import subprocess
 import sys
 from pathlib import Path
 
+import own_process
 import rewritten
 
 from slamcli.console import table
@@ -50,9 +50,8 @@ def run_of(lists: rewritten.Listed, frames: int, out: Path, *, turning: bool) ->
     recording = rewritten.write(out / name, rewritten.again(lists, frames, turning=turning))
     folder = out / f"{name}.run"
     for stage in NAMES:  # each in a process of its own: what it holds at its peak is its own, too
-        command = [sys.executable, "-m", "slamcli", "run", str(recording), "-r", str(folder), "--until", stage]
-        subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
-    return RunDir.find(str(folder))
+        run = own_process.run(recording, path=folder, until=stage)
+    return run.directory
 
 
 def rows(short: RunDir, long: RunDir, first: int, frames: int) -> list[list[str]]:

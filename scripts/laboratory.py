@@ -13,8 +13,6 @@ OUT/seed<N> keeps recording, run and pictures; a recording or run that is there 
 import argparse
 import itertools
 import json
-import subprocess
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,7 +20,10 @@ import numpy as np
 from lab_laser import laser_grid
 from lab_measure import Reading, measure, outlines, table_2
 
+import slamcli
+from slamcli import console
 from slamcli.cli.grid import camera_path
+from slamcli.datasets.simulate import simulate
 from slamcli.errors import SlamError
 from slamcli.evaluation import grid_truth
 from slamcli.evaluation.grid_truth import Scene
@@ -33,7 +34,7 @@ from slamcli.runs.run_directory import RunDir
 from slamcli.schema import Features, Grid, Ground, Map, Tracks, frame_poses
 from slamcli.visualization.grid_picture import draw
 
-PAPER = {"--speed": 0.15, "--turn-rate": 0.15, "--rate": 15, "--laps": 1.03, "--field-of-view": 57, "--depth-min": 1.2, "--depth-max": 3.5}
+PAPER = {"speed": 0.15, "turn_rate": 0.15, "laps": 1.03, "field_of_view": 57.0, "depth_min": 1.2, "depth_max": 3.5, "frames": None}
 SENSOR = ("sensor.depth_min=1.2", "sensor.depth_max=3.5", "grid2d.min_range=1.2", "grid2d.max_range=3.5")
 RADIUS, HEIGHT, GROUND_CLEARANCE = 0.2, 0.5, 0.05  # [m] of the robot
 LASER_HEIGHT = 0.2  # [m]
@@ -91,10 +92,8 @@ def prepare(folder: Path, seed: int, settings: list[str], rate: float) -> Lab:
     recording, path = folder / "recording", folder / "run"
     folder.mkdir(parents=True, exist_ok=True)
     if not recording.exists():
-        options = [str(word) for pair in {**PAPER, "--rate": rate, "--seed": seed}.items() for word in pair]
-        slamcli("simulate", str(recording), *options)
-    slamcli("run", str(recording), "-r", str(path), *(word for s in (*SENSOR, *settings) for word in ("-s", s)))
-    run = RunDir(path)
+        simulate(recording, progress=console.progress, rate=rate, seed=seed, **PAPER)
+    run = slamcli.run(recording, path=path, settings=(*SENSOR, *settings), progress=console.progress, tell=console.say).directory
     scene, grid = grid_truth.read_scene(recording / "scene.json"), run.load(Grid, "grid2d")
     T_wc = frame_poses(run.load(Tracks, "loop"), run.load(Map, "loop"))
     T_lc = run.load(Ground, "densify").T_lw @ T_wc
@@ -106,11 +105,6 @@ def prepare(folder: Path, seed: int, settings: list[str], rate: float) -> Lab:
     rng = np.random.default_rng([seed, 7])
     laser = laser_grid(scene, truth[frames], T_lc[frames], grid, rng)
     return Lab(run, scene, grid, laser, T_lc[frames], truth[frames], T_sl, frames)
-
-
-def slamcli(*words: str) -> None:
-    """Run a command of the program."""
-    subprocess.run([sys.executable, "-m", "slamcli", *words], check=True, stdout=subprocess.DEVNULL)
 
 
 def true_poses(run: RunDir) -> np.ndarray:

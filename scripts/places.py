@@ -9,15 +9,17 @@ from the runs' records, the truth from groundtruth.txt. With --orbslam3, see orb
 """
 
 import argparse
-import subprocess
-import sys
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import rivals
 
+import slamcli
+from slamcli import console
 from slamcli.console import table
+from slamcli.datasets.simulate import simulate
 from slamcli.datasets.tum import associate
 from slamcli.evaluation import trajectory_error
 from slamcli.geometry import se3
@@ -77,26 +79,25 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=540)
     parser.add_argument("--orbslam3", nargs=2, metavar=("PYTHON", "WORDS"))
     given = parser.parse_args()
-    rooms = {f"room{seed}": ["--seed", str(seed)] for seed in given.seeds}
+    rooms: dict[str, dict[str, Any]] = {f"room{seed}": {"seed": seed} for seed in given.seeds}
     for seed in given.alias_seeds:
-        rooms |= {f"{name}{seed}": ["--alias", alias, "--seed", str(seed + more)] for name, (alias, more) in ROOMS.items()}
+        rooms |= {f"{name}{seed}": {"alias": alias, "seed": seed + more} for name, (alias, more) in ROOMS.items()}
     found = []
     for name, options in rooms.items():
-        drive = ["--laps", str(given.laps), "--frames", str(given.frames)]
-        found.append(one(given.out / name, name, [*options, *drive], given.laps, given.orbslam3))
+        drive = {"laps": given.laps, "frames": given.frames}
+        found.append(one(given.out / name, name, {**options, **drive}, given.laps, given.orbslam3))
         print(table([HEADINGS, found[-1].row()], right=range(1, len(HEADINGS))), flush=True)
     print("\n" + table([HEADINGS, *(figures.row() for figures in found)], right=range(1, len(HEADINGS))))
     summary(found)
 
 
-def one(folder: Path, name: str, options: list[str], laps: float, rival: list[str] | None) -> Figures:
+def one(folder: Path, name: str, settings: dict[str, Any], laps: float, rival: list[str] | None) -> Figures:
     """Render and run one room, unless done already, and compare with the truth."""
     recording, path = folder / "recording", folder / "run"
     folder.mkdir(parents=True, exist_ok=True)
     if not recording.exists():
-        slamcli("simulate", str(recording), *options)
-    slamcli("run", str(recording), "-r", str(path), "--until", "grid2d")
-    run = RunDir.find(str(path))
+        simulate(recording, progress=console.progress, **settings)
+    run = slamcli.run(recording, path=path, progress=console.progress, tell=console.say).directory
     truth, n_frames = trajectory_error.ground_truth(run), len(run.load(Features, "extract").stamp)
     ape = {}
     for stage in trajectory_error.STAGES:
@@ -150,11 +151,6 @@ def summary(found: list[Figures]) -> None:
         )
         if drifted.any():
             print(f"where track drifted by more than 0.02 m, loop leaves at most {(after / before)[drifted].max():.2f} of it")
-
-
-def slamcli(*arguments: str) -> None:
-    """Give a command."""
-    subprocess.run([sys.executable, "-m", "slamcli", *arguments], check=True, stdout=subprocess.DEVNULL)
 
 
 if __name__ == "__main__":

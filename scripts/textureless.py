@@ -8,18 +8,20 @@ again. With --orbslam3, see orbslam3.py, it tracks the same images; a dash means
 """
 
 import argparse
-import subprocess
-import sys
 from pathlib import Path
+from typing import Any
 
 import rivals
 
+import slamcli
+from slamcli import console
 from slamcli.console import table
+from slamcli.datasets.simulate import simulate
 from slamcli.evaluation import trajectory_error
 from slamcli.runs.run_directory import RunDir
 from slamcli.schema import Features
 
-ROOMS = {"dark": ["--dark"], "plain": ["--textured", "0"], "mixed": ["--textured", "0.3"]}
+ROOMS: dict[str, dict[str, Any]] = {"dark": {"dark": True}, "plain": {"textured": 0.0}, "mixed": {"textured": 0.3}}
 HEADINGS = ["room", "frames", "with a pose", "on shape", "track [m]", "optimize [m]", "loop [m]", "track CPU [ms/frame]", "ORB-SLAM3 [m]"]
 
 
@@ -28,27 +30,26 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path)
     parser.add_argument("--seeds", type=int, nargs="*", default=[0, 1, 2])
-    parser.add_argument("--laps", default="1.33")
-    parser.add_argument("--frames", default="440")
+    parser.add_argument("--laps", type=float, default=1.33)
+    parser.add_argument("--frames", type=int, default=440)
     parser.add_argument("--orbslam3", nargs=2, metavar=("PYTHON", "WORDS"))
     given = parser.parse_args()
     rows = []
     for kind, options in ROOMS.items():
         for seed in given.seeds:
-            drive = ["--seed", str(seed), "--laps", given.laps, "--frames", given.frames]
-            rows.append(one(given.out / f"{kind}{seed}", [*options, *drive], given.orbslam3))
+            drive = {"seed": seed, "laps": given.laps, "frames": given.frames}
+            rows.append(one(given.out / f"{kind}{seed}", {**options, **drive}, given.orbslam3))
             print(table([HEADINGS, rows[-1]], right=range(1, len(HEADINGS))), flush=True)
     print("\n" + table([HEADINGS, *rows], right=range(1, len(HEADINGS))))
 
 
-def one(folder: Path, options: list[str], rival: list[str] | None) -> list[str]:
+def one(folder: Path, settings: dict[str, Any], rival: list[str] | None) -> list[str]:
     """Render and run one room, unless done already, and compare with the truth; gives a line of the table."""
     recording, path = folder / "recording", folder / "run"
     folder.mkdir(parents=True, exist_ok=True)
     if not recording.exists():
-        slamcli("simulate", str(recording), *options)
-    slamcli("run", str(recording), "-r", str(path), "--until", "loop")
-    run = RunDir.find(str(path))
+        simulate(recording, progress=console.progress, **settings)
+    run = slamcli.run(recording, path=path, until="loop", progress=console.progress, tell=console.say).directory
     truth, n_frames = trajectory_error.ground_truth(run), len(run.load(Features, "extract").stamp)
     errors = [
         trajectory_error.ape(trajectory_error.stage_trajectory(run, s), truth, n_frames=n_frames, name=s).error
@@ -71,11 +72,6 @@ def of_rival(run: RunDir, python: str, words: str) -> str:
     """Give ORB-SLAM3's APE, a dash where it has no pose to compare."""
     ape = rivals.orbslam3(run, python, words)["ape"]
     return "-" if ape is None else f"{ape:.4f}"
-
-
-def slamcli(*arguments: str) -> None:
-    """Give a command."""
-    subprocess.run([sys.executable, "-m", "slamcli", *arguments], check=True, stdout=subprocess.DEVNULL)
 
 
 if __name__ == "__main__":

@@ -1,13 +1,18 @@
-"""Talk to the person at the terminal: progress, log, tables. All of it goes to stderr; results go to stdout."""
+"""Talk to the person at the terminal: progress, log, tables. All of it goes to stderr; results go to stdout.
+
+The library takes a `Progress` and a `Tell` from its caller: the command line gives `progress` and `say`, a notebook its own or none.
+"""
 
 import logging
 import sys
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
 Item = TypeVar("Item")
+Progress = Callable[..., Iterable[Any]]  # (items, label, total=None) -> the same items, one by one
+Tell = Callable[[str], Any]  # takes a line
 ROOT = logging.getLogger("slamcli")
 
 
@@ -50,6 +55,11 @@ def log_file(path: Path) -> Iterator[None]:
     finally:
         ROOT.removeHandler(handler)
         handler.close()
+
+
+def silent(iterable: Iterable[Item], label: str = "", total: int | None = None) -> Iterable[Item]:
+    """Pass the items through and show nothing."""
+    return iterable
 
 
 def progress(iterable: Iterable[Item], label: str, total: int | None = None) -> Iterator[Item]:

@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 from types import ModuleType
 
+from slamcli import console
 from slamcli.config.options import Config
 from slamcli.runs.pipeline import Pipeline
 from slamcli.runs.run_directory import RunDir
@@ -76,7 +77,7 @@ def make_run(path: Path, root: Path, config: Config | None = None) -> Pipeline:
     dataset = FakeDataset(root)
     run = RunDir.create(path, dataset="fake", root=str(root), digest=dataset.digest())
     run.write_config(config or run.config())
-    return Pipeline(run, run.config(), dataset=dataset)
+    return Pipeline(run, run.config(), dataset=dataset, tell=console.say)
 
 
 def digests(run: RunDir) -> dict[str, str]:

@@ -11,7 +11,7 @@ from slamcli.config.options import Config
 from slamcli.formats.cloud import write_ply
 from slamcli.formats.trajectory import write_tum
 from slamcli.geometry import se3
-from slamcli.runs import pipeline, staleness
+from slamcli.runs import pipeline, source_code, staleness
 from slamcli.runs.run_directory import RunDir, outputs
 from slamcli.schema import FORMAT, Closures, Features, Ground, Map, Timing, Tracks, Trajectory, trajectory
 from slamcli.stages import STAGES
@@ -147,11 +147,12 @@ def _map(T_wk: np.ndarray, kf_frame: np.ndarray) -> Map:
 
 def _record(run: RunDir, stage: pipeline.Stage, out: Path, frames: int) -> dict:
     declared = staleness.declared(stage, run.config())
+    code = dict(source_code.of_stage(stage.name))
     inputs = {need: "sha256:0" if need == "dataset" else run.record(need)["digest"] for need in stage.needs}
     files = outputs(out)
     return {
-        "format": FORMAT, "stage": stage.name, "key": staleness.key(declared, inputs),
-        "config": declared, "inputs": inputs, "outputs": files,
+        "format": FORMAT, "stage": stage.name, "key": staleness.key(declared, inputs, code),
+        "config": declared, "inputs": inputs, "code": code, "outputs": files,
         "digest": staleness.digest({name: entry["sha256"] for name, entry in files.items()}), "environment": pipeline.environment(),
         "seconds": 1.5, "cpu_seconds": 2.0, "compile_seconds": 0.0, "fps": frames / 1.5, "peak_rss_mb": 200.0,
         "summary": {"frames": frames}, "warnings": [], "n_warnings": 0,

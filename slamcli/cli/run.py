@@ -2,9 +2,6 @@
 
 import json
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -13,9 +10,6 @@ from slamcli.cli.common import config_option, json_option, run_option, set_optio
 from slamcli.stages import NAMES, STAGES, Stage
 
 if TYPE_CHECKING:
-    from slamcli.config.options import Config
-    from slamcli.datasets import Dataset
-    from slamcli.runs.pipeline import Pipeline
     from slamcli.runs.run_directory import RunDir
     from slamcli.runs.staleness import State
 
@@ -51,59 +45,16 @@ def run_command(
       slamcli run tum/fr1_room -s extract.features=1500
       slamcli run path/to/recording -r runs/mine --config accurate
     """
-    from slamcli import console
-    from slamcli.config import toml
-    from slamcli.runs.run_directory import RunDir
+    from slamcli import api, console
     from slamcli.runs.summary import outcome
 
-    if target is None:
-        rundir, dataset = RunDir.find(run), None
-        config = toml.resolve(rundir.config(), config_name, assignments)
-    else:
-        rundir, dataset, config = _run_of(target, run, data, config_name, assignments)
-    with _writing(rundir, config, dataset) as pipeline:
-        rundir.mark_latest()
-        pipeline.bring_up_to_date(start=start, until=until, force=force)
-    if until is None and (made := outcome(rundir)):
-        console.say(made)
-    click.echo(rundir.path)
-
-
-def _run_of(
-    target: str, run: str | None, data: str | None, config_name: str | None, assignments: tuple[str, ...]
-) -> "tuple[RunDir, Dataset, Config]":
-    """Open the recording and make or open its run."""
-    from slamcli.config import toml
-    from slamcli.runs.run_directory import RunDir, default_path
-
     named = run or os.environ.get("SLAMCLI_RUN")
-    config = toml.resolve(RunDir(Path(named)).config() if named else None, config_name, assignments)
-    dataset = _open(target, data, config)
-    path = Path(named) if named else default_path(dataset.name)
-    camera = config.camera
-    config = toml.resolve(RunDir(path).config(), config_name, assignments)
-    if config.camera != camera:  # only now is it known that an earlier command gave this run another camera
-        dataset = _open(target, data, config)
-    rundir = RunDir.create(path, dataset=dataset.name, root=str(dataset.root.resolve()), digest=dataset.digest())
-    return rundir, dataset, config
-
-
-def _open(target: str, data: str | None, config: "Config") -> "Dataset":
-    from slamcli import console
-    from slamcli.datasets import open_dataset
-
-    return open_dataset(target, data=data, camera=dict(config.camera) or None, progress=console.progress)
-
-
-@contextmanager
-def _writing(rundir: "RunDir", config: "Config", dataset: "Dataset | None" = None) -> "Iterator[Pipeline]":
-    """Lock the run, log to its file, and make `config` its configuration."""
-    from slamcli import console
-    from slamcli.runs.pipeline import Pipeline
-
-    with rundir.lock(), console.log_file(rundir.path / "log.txt"):
-        rundir.write_config(config)
-        yield Pipeline(rundir, config, dataset=dataset)
+    options: dict[str, Any] = {"settings": assignments, "config": config_name, "start": start, "until": until, "force": force}
+    options |= {"progress": console.progress, "tell": console.say}
+    done = api.open_run(named).update(**options) if target is None else api.run(target, path=named, data=data, **options)
+    if until is None and (made := outcome(done.directory)):
+        console.say(made)
+    click.echo(done.path)
 
 
 def _stage_command(stage: Stage) -> click.Command:
@@ -111,12 +62,9 @@ def _stage_command(stage: Stage) -> click.Command:
     @run_option
     @set_option
     def command(run: str | None, assignments: tuple[str, ...]) -> None:
-        from slamcli.config import toml
-        from slamcli.runs.run_directory import RunDir
+        from slamcli import api, console
 
-        rundir = RunDir.find(run)
-        with _writing(rundir, toml.apply(rundir.config(), assignments)) as pipeline:
-            pipeline.run_alone(stage.name)
+        api.open_run(run).run_stage(stage.name, settings=assignments, progress=console.progress, tell=console.say)
 
     return command
 

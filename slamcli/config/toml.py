@@ -16,6 +16,8 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
+Settings = Mapping[str, Any] | Iterable[str]  # values by full name, or the texts that follow -s
+
 LARGEST_FILE = 1 << 20  # bytes; ours have about ten thousand
 COMPARISONS = {
     "ge": (">=", lambda value, bound: value >= bound),
@@ -104,12 +106,20 @@ def _parse(text: str) -> Any:
     return parsed["value"] if len(parsed) == 1 else text
 
 
-def resolve(base: Config | None, name_or_file: str | None, assignments: Iterable[str]) -> Config:
-    """Give the configuration of a command: `base` (a run's own, or the defaults) unless `--config` is given, then each `-s`."""
+def resolve(base: Config | None, name_or_file: str | None, settings: Settings) -> Config:
+    """Give the configuration of a command: `base` (a run's own, or the defaults) unless a configuration is named, then each setting."""
     config = base or Config()
     if name_or_file:
         config = read(find(name_or_file))
-    return apply(config, assignments)
+    return set_options(config, settings) if isinstance(settings, Mapping) else apply(config, settings)
+
+
+def set_options(base: Config, values: Mapping[str, Any]) -> Config:
+    """Lay values by their full names over `base`, such as ``{"track.min_inliers": 20, "seed": 1}``."""
+    for key, value in values.items():
+        section, dot, option = key.partition(".")
+        base = merge(base, {section: {option: value} if dot else value}, source="settings")
+    return base
 
 
 def _sections() -> dict[str, Any]:

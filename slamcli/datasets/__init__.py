@@ -6,14 +6,14 @@ line in READERS.
 
 import os
 import re
-from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
-from slamcli import user_cache
+from slamcli.console import Progress, silent
 from slamcli.datasets import tum
 from slamcli.datasets.recording import Dataset
 from slamcli.errors import SlamError
+from slamcli.user_cache import user_cache
 
 __all__ = ["READERS", "Dataset", "open_dataset", "silent"]
 
@@ -25,13 +25,6 @@ ALIASES = {
     "fr3_office": "rgbd_dataset_freiburg3_long_office_household",
     "fr3_nst": "rgbd_dataset_freiburg3_nostructure_texture_near_withloop",
 }
-
-Progress = Callable[..., Iterable]
-
-
-def silent(iterable: Iterable, label: str = "", total: int | None = None) -> Iterable:
-    """Progress that shows nothing."""
-    return iterable
 
 
 def open_dataset(target: str, *, data: str | None = None, camera: dict[str, Any] | None = None, progress: Progress = silent) -> Dataset:

@@ -15,7 +15,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from slamcli import console
+from slamcli.console import Progress, Tell, silent
 
 PACKAGE = Path(__file__).parents[1]
 PACKAGES = (
@@ -29,22 +29,26 @@ PACKAGES = (
     "dense",
     "navigation",
 )  # that hold the kernels of a run
-CHILD = "import sys; from slamcli import compilation; compilation.compile_share(int(sys.argv[1]), int(sys.argv[2]))"
+CHILD = "import sys; from slamcli.jit import compilation; compilation.compile_share(int(sys.argv[1]), int(sys.argv[2]))"
 MOST_PROCESSES = 8
+COMPILING = "compiling kernels; this happens once"
 log = logging.getLogger(__name__)
 
 
-def ensure() -> None:
+def ensure(*, progress: Progress = silent, tell: Tell = log.info) -> None:
     """Compile what the run will call, if that was not done on this machine for these sources."""
-    done = Path(os.environ["NUMBA_CACHE_DIR"]) / f"compiled-{_digest()}"
+    from slamcli.jit import cache
+
+    done = cache.folder() / f"compiled-{_digest()}"
     if done.exists():
         return
     start, n = time.perf_counter(), 0
-    console.say("compiling kernels; this happens once")
-    for _ in console.progress(compile_all(_cores()), "compiling [kernels]"):
+    tell(COMPILING)
+    for _ in progress(compile_all(_cores()), "compiling [kernels]"):
         n += 1
     log.info("compiled %d kernels in %.1f s", n, time.perf_counter() - start)
-    with contextlib.suppress(OSError):  # a cache for this process alone: nothing to remember
+    with contextlib.suppress(OSError):  # a full disk: the next run looks again, and finds what could be kept
+        done.parent.mkdir(parents=True, exist_ok=True)
         done.touch()
 
 
@@ -53,8 +57,9 @@ def compile_all(processes: int) -> Iterator[str]:
 
     Nobody reads the errors that numba words, in colour, for every candidate type it tries in vain: without them it is a tenth faster.
     """
-    cache = os.path.abspath(os.environ["NUMBA_CACHE_DIR"])
-    environment = {**os.environ, "NUMBA_CACHE_DIR": cache, "NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING": "1"}
+    from slamcli.jit import cache
+
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(cache.folder().parent), "NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING": "1"}
     home = Path(__file__).parents[2]  # there a child finds this very package first: another copy's kernels are cached apart
     with contextlib.ExitStack() as stack:
         read, write = os.pipe()

@@ -5,6 +5,8 @@ from typing import Any
 
 from numba import njit
 
+from slamcli.jit.cache import KernelCache
+
 DECLARED: list[Any] = []  # dispatchers of the kernels whose arguments are annotated, in the order of their import
 
 
@@ -16,7 +18,8 @@ def kernel(function: Callable | None = None, **options: Any) -> Any:
     """
     if function is None:
         return lambda function: kernel(function, **options)
-    compiled = njit(cache=True, nogil=True, **options)(function)
+    compiled = njit(nogil=True, **options)(function)
+    compiled._cache = KernelCache(function)  # what `cache=True` does, but with a folder of our own
     if argument_types(compiled):
         DECLARED.append(compiled)
     return compiled

@@ -8,6 +8,9 @@ import time
 from types import TracebackType
 from typing import Any
 
+from slamcli.console import Tell
+from slamcli.jit.compilation import COMPILING
+
 SAMPLING = 0.02  # [s] between looks at the resident memory
 
 
@@ -39,12 +42,12 @@ class Meter:
             event.unregister("numba:compile", self._watch)
             self.compile_seconds = self._watch.total
 
-    def watch_compiler(self) -> None:
-        """Count compilation from here on, if numba has been imported by now."""
+    def watch_compiler(self, tell: Tell) -> None:
+        """Count compilation from here on, if numba has been imported by now; `tell` hears of the first."""
         if "numba" in sys.modules:
             from numba.core import event
 
-            self._watch = _compiler_watch()
+            self._watch = _compiler_watch(tell)
             event.register("numba:compile", self._watch)
 
     def _sample(self) -> None:
@@ -64,11 +67,9 @@ def _resident_mb() -> float:
         return peak / 2**20 if sys.platform == "darwin" else peak / 2**10
 
 
-def _compiler_watch() -> Any:
+def _compiler_watch(tell: Tell) -> Any:
     """Build the listener that adds up the time of real compilations; loading from numba's cache is none."""
     from numba.core import event
-
-    from slamcli.console import say
 
     class Watch(event.Listener):
         depth, start, total = 0, 0.0, 0.0  # a kernel compiles the helpers it calls within its own compilation
@@ -77,7 +78,7 @@ def _compiler_watch() -> Any:
             if self.depth == 0:
                 self.start = time.perf_counter()
                 if self.total == 0.0:
-                    say("compiling kernels; this happens once")
+                    tell(COMPILING)
             self.depth += 1
 
         def on_end(self, _: event.Event) -> None:

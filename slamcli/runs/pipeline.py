@@ -5,17 +5,18 @@ import logging
 import math
 import platform
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from slamcli import __version__, console, files
+from slamcli import __version__, files
 from slamcli.config.options import Config
+from slamcli.console import Progress, Tell, silent, stage_line
 from slamcli.errors import SlamError
 from slamcli.jit import compilation
 from slamcli.parallel import one_thread_in_blas
-from slamcli.runs import run_directory, staleness
+from slamcli.runs import run_directory, source_code, staleness
 from slamcli.runs.cost_meter import Meter
 from slamcli.runs.run_directory import RunDir
 from slamcli.runs.staleness import State
@@ -30,7 +31,6 @@ if TYPE_CHECKING:
 
 __all__ = ["NAMES", "STAGES", "Inputs", "Pipeline", "Settings", "Stage", "Tools"]
 
-Item = TypeVar("Item")
 Record = TypeVar("Record")
 log = logging.getLogger(__name__)
 
@@ -83,17 +83,17 @@ class Inputs:
 
 
 class Tools:
-    """What a stage may use beside its inputs: threads, progress, warnings, random numbers."""
+    """What a stage may use beside its inputs: threads, progress, warnings, random numbers.
 
-    def __init__(self, stage: str, config: Config) -> None:
+    progress : passes items through under a bar, as ``progress(items, label, total=None)``
+    """
+
+    def __init__(self, stage: str, config: Config, progress: Progress = silent) -> None:
+        self.progress = progress
         self.workers = config.run.workers
         self.warnings: list[str] = []
         self.n_warnings = 0
         self._stage, self._seed = stage, config.seed
-
-    def progress(self, iterable: Iterable[Item], label: str, total: int | None = None) -> Iterator[Item]:
-        """Pass items through under a progress bar."""
-        return console.progress(iterable, label, total)
 
     def warn(self, message: str) -> None:
         """Tell the user of something that was worked round; the record keeps it."""
@@ -114,8 +114,11 @@ class Tools:
 class Pipeline:
     """The stages of one run under one configuration."""
 
-    def __init__(self, run: RunDir, config: Config, *, dataset: "Dataset | None" = None) -> None:
+    def __init__(
+        self, run: RunDir, config: Config, *, dataset: "Dataset | None" = None, progress: Progress = silent, tell: Tell = log.info
+    ) -> None:
         self.run, self.config = run, config
+        self._progress, self._tell = progress, tell
         self.recording_note = ""  # why the recording could not be looked at, where it could not
         self._opened = dataset
         self._dataset_digest: str | None = None
@@ -168,7 +171,7 @@ class Pipeline:
         for index, stage in enumerate(STAGES[: last + 1]):
             state = self.states()[stage.name]
             if state.is_fresh and index < first_forced:
-                console.say(f"{stage.name:<9}  {state.state}")
+                self._tell(f"{stage.name:<9}  {state.state}")
                 continue
             log.info("%s: %s", stage.name, state.reason or state.state if index < first_forced else "asked for")
             self.run_stage(stage)
@@ -190,23 +193,23 @@ class Pipeline:
     def run_stage(self, stage: Stage) -> None:
         """Run one stage and put its folder in place; whatever goes wrong, the result before stays."""
         inputs = {name: self._present_input(name) for name in (*stage.needs, *staleness.named_files(stage, self.config))}
-        tools = Tools(stage.name, self.config)
+        tools = Tools(stage.name, self.config, self._progress)
         if stage is STAGES[0]:  # the record of the first stage is where the recording's own faults belong
             for warning in self.dataset().warnings:
                 tools.warn(warning)
-        compilation.ensure()
+        compilation.ensure(progress=self._progress, tell=self._tell)
         with self.run.writing(stage.name) as out:
             try:
                 with Meter() as meter, one_thread_in_blas():
                     module = importlib.import_module(f"slamcli.stages.{stage.name}")
-                    meter.watch_compiler()
+                    meter.watch_compiler(self._tell)
                     summary = module.run(Inputs(stage, self.run, self.dataset), out, Settings(stage, self.config), tools)
             except KeyboardInterrupt:
                 raise KeyboardInterrupt(f"interrupted in {stage.name}; earlier stages are kept") from None
             record = self._record(stage, inputs, run_directory.outputs(out), meter, tools, summary)
             self.run.commit(stage.name, out, record)
         log.debug("%s", record)
-        console.say(console.stage_line(record))
+        self._tell(stage_line(record))
 
     def _present_input(self, name: str) -> str:
         if name in NAMES:
@@ -228,14 +231,15 @@ class Pipeline:
         tools: Tools,
         summary: Mapping[str, Any],
     ) -> dict[str, Any]:
-        declared = staleness.declared(stage, self.config)
+        declared, code = staleness.declared(stage, self.config), source_code.of_stage(stage.name)
         frames = summary.get("frames")
         return {
             "format": FORMAT,
             "stage": stage.name,
-            "key": staleness.key(declared, inputs),
+            "key": staleness.key(declared, inputs, code),
             "config": declared,
             "inputs": dict(inputs),
+            "code": dict(code),
             "outputs": outputs,
             "digest": staleness.digest({name: entry["sha256"] for name, entry in outputs.items()}),
             "environment": environment(),

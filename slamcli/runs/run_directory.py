@@ -19,7 +19,7 @@ from slamcli.config import toml
 from slamcli.config.options import Config
 from slamcli.errors import SlamError
 from slamcli.files import read_json, sha256, write_text
-from slamcli.runs import staleness
+from slamcli.runs import source_code, staleness
 from slamcli.runs.staleness import State
 from slamcli.schema import FORMAT
 from slamcli.stages import NAMES, STAGES
@@ -172,7 +172,7 @@ class RunDir:
         for stage in STAGES:
             damage = self.damage(stage.name, verify=verify)
             record = None if damage else self.record(stage.name)
-            states[stage.name] = staleness.assess(stage, config, record, damage, states, input_digest)
+            states[stage.name] = staleness.assess(stage, config, record, damage, states, input_digest, source_code.of_stage(stage.name))
         return states
 
     def record(self, stage: str) -> dict[str, Any] | None:
@@ -271,4 +271,6 @@ def _is_record(record: Mapping[str, Any]) -> bool:
     if not all(isinstance(record.get(name), kind) for name, kind in RECORD_KEYS.items()) or "slamcli" not in record["environment"]:
         return False
     entries = record["outputs"].values()
-    return all(isinstance(e, dict) and isinstance(e.get("bytes"), int) and isinstance(e.get("sha256"), str) for e in entries)
+    return isinstance(record.get("code", {}), dict) and all(
+        isinstance(e, dict) and isinstance(e.get("bytes"), int) and isinstance(e.get("sha256"), str) for e in entries
+    )

@@ -6,8 +6,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, fields
 from typing import Any
 
-from slamcli import __version__
 from slamcli.config.options import Config
+from slamcli.runs import source_code
 from slamcli.schema import FORMAT
 from slamcli.stages import Stage
 
@@ -49,9 +49,9 @@ def named_files(stage: Stage, config: Config) -> dict[str, str]:
     return found
 
 
-def key(values: Mapping[str, Any], inputs: Mapping[str, str]) -> str:
+def key(values: Mapping[str, Any], inputs: Mapping[str, str], code: Mapping[str, str]) -> str:
     """Digest everything a stage's result depends on."""
-    return digest({"format": FORMAT, "slamcli": __version__, "config": values, "inputs": inputs})
+    return digest({"format": FORMAT, "config": values, "inputs": inputs, "code": code})
 
 
 def digest(value: Any) -> str:
@@ -66,30 +66,32 @@ def assess(
     damage: str,
     before: Mapping[str, State],
     input_digest: Callable[[str], str | None],
+    code: Mapping[str, str],
 ) -> State:
     """Judge one stage; cheap and certain causes come first, and the first cause found is the reason given.
 
     record : its `stage.json`, None where the stage has no folder; damage : what is wrong with that folder, or ""
     before : the states of the stages it needs
     input_digest : gives the present digest of "dataset" or of a file an option names; None believes the recorded one
+    code : the present digests of the sources that the stage can reach
     """
     if damage:
         return State(stage.name, DAMAGED, damage)
     if record is None:
         return State(stage.name, MISSING)
     reason = (
-        _changed_code(record)
+        _changed_code(record, code)
         or _changed_config(record["config"], declared(stage, config))
         or _changed_inputs(stage, config, record["inputs"], before, input_digest)
     )
     return State(stage.name, STALE if reason else UP_TO_DATE, reason, record=record)
 
 
-def _changed_code(record: Mapping[str, Any]) -> str:
+def _changed_code(record: Mapping[str, Any], code: Mapping[str, str]) -> str:
     if record["format"] != FORMAT:
         return f"code: format {record['format']} -> {FORMAT}"
-    made_with = record["environment"]["slamcli"]
-    return "" if made_with == __version__ else f"code: slamcli {made_with} -> {__version__}"
+    changes = source_code.changes(record.get("code", {}), code)
+    return f"code: {changes}" if changes else ""
 
 
 def _changed_config(recorded: Mapping[str, Any], now: Mapping[str, Any]) -> str:

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import pytest
 
-from slamcli.jit import compilation
+from slamcli.jit import cache, compilation
 from slamcli.jit.kernel import argument_types
 
 WATCHED_RUN = """
 import sys
-from slamcli.cli.main import cli  # before numba: it says where the cache is
 from numba.core import event
+from slamcli.cli.main import cli
 
 class Watch(event.Listener):
     def on_start(self, found):
@@ -46,7 +46,7 @@ def test_every_process_takes_its_share_and_together_they_take_all() -> None:
 
 def test_what_is_compiled_is_not_compiled_again(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     calls = []
-    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    monkeypatch.setattr(cache, "folder", lambda: tmp_path / "kernels")
     monkeypatch.setattr(compilation, "compile_all", lambda processes: calls.append(processes) or iter(("one", "two")))
     compilation.ensure()
     compilation.ensure()
@@ -56,7 +56,7 @@ def test_what_is_compiled_is_not_compiled_again(monkeypatch: pytest.MonkeyPatch,
 
 def test_other_sources_are_compiled_again(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     calls = []
-    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    monkeypatch.setattr(cache, "folder", lambda: tmp_path / "kernels")
     monkeypatch.setattr(compilation, "compile_all", lambda processes: calls.append(processes) or iter(()))
     compilation.ensure()
     monkeypatch.setattr(compilation, "PACKAGES", ("geometry",))
@@ -85,3 +85,12 @@ def test_an_interruption_ends_the_processes_that_compile(monkeypatch: pytest.Mon
     names.close()
     with pytest.raises(ProcessLookupError):
         os.kill(pid, 0)
+
+
+def test_the_processes_really_compile_and_leave_their_kernels_in_the_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(cache, "folder", lambda: tmp_path / "kernels")
+    few = "import sys; from slamcli.jit import compilation; compilation.PACKAGES = ('geometry',); compilation.compile_share(0, 1)"
+    monkeypatch.setattr(compilation, "CHILD", few)
+    names = list(compilation.compile_all(1))
+    assert names
+    assert len(list(tmp_path.rglob("*.nbc"))) >= len(names)

@@ -10,6 +10,7 @@ from pathlib import Path
 import fakes
 import pytest
 
+from slamcli import console
 from slamcli.config import toml
 from slamcli.config.options import Config
 from slamcli.errors import SlamError
@@ -39,7 +40,7 @@ def told_as_run(capsys: pytest.CaptureFixture) -> list[str]:
 
 def under(pipeline: Pipeline, *assignments: str) -> Pipeline:
     """The same run with other settings."""
-    return Pipeline(pipeline.run, toml.apply(pipeline.config, assignments), dataset=pipeline.dataset())
+    return Pipeline(pipeline.run, toml.apply(pipeline.config, assignments), dataset=pipeline.dataset(), tell=console.say)
 
 
 def not_fresh(pipeline: Pipeline) -> dict[str, str]:

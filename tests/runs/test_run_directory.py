@@ -172,7 +172,7 @@ def test_damage_is_mended_by_running_again(run: RunDir) -> None:
 def test_a_result_of_another_version_is_stale(run: RunDir) -> None:
     record = run.record("track")
     for change, reason in (
-        ({"environment": {**record["environment"], "slamcli": "0.0.1"}}, "code: slamcli 0.0.1 -> "),
+        ({"code": {**record["code"], "slam/tracker.py": "0" * 12}}, "code: slam/tracker.py changed"),
         ({"format": FORMAT - 1}, f"code: format {FORMAT - 1} -> {FORMAT}"),
     ):
         (run.path / "track" / "stage.json").write_text(json.dumps({**record, **change}))

@@ -1,0 +1,252 @@
+"""The program from Python: make a run, open one, read what it made.
+
+>>> import slamcli
+>>> run = slamcli.run("demo", settings={"track.min_inliers": 20}, until="loop")
+>>> run.trajectory("track").T_wc  # (N, 4, 4), camera to world
+
+Nothing is printed: progress goes to the `progress` of the caller, single lines to `tell`, warnings to the logger "slamcli".
+"""
+
+import logging
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from slamcli.config import toml
+from slamcli.config.options import Config
+from slamcli.config.toml import Settings
+from slamcli.console import Progress, Tell, log_file, silent
+from slamcli.runs.pipeline import Pipeline
+from slamcli.runs.run_directory import RunDir, default_path
+from slamcli.runs.staleness import State
+from slamcli.stages import NAMES
+
+if TYPE_CHECKING:
+    from slamcli.datasets import Dataset
+    from slamcli.evaluation.trajectory_error import Ape, Rpe
+    from slamcli.formats.cloud import Points
+    from slamcli.geometry.camera import Camera
+    from slamcli.geometry.octree import Octree
+    from slamcli.schema import Grid, Ground, Trajectory
+
+__all__ = ["Run", "open_run", "run"]
+
+log = logging.getLogger(__name__)
+
+
+def run(
+    target: str | os.PathLike[str],
+    *,
+    settings: Settings = (),
+    config: str | None = None,
+    path: str | os.PathLike[str] | None = None,
+    data: str | None = None,
+    start: str | None = None,
+    until: str | None = None,
+    force: bool = False,
+    progress: Progress = silent,
+    tell: Tell = log.info,
+) -> "Run":
+    """Make a run of a recording, or bring the one that is there up to date: exactly the stages that need it.
+
+    target : a recording's folder, a name such as ``tum/fr1_room``, or ``demo``
+    settings : options by full name, ``{"track.min_inliers": 20}``, laid over the run's own (the defaults for a new run)
+    config : fast, accurate, default or a TOML file, to start from instead of the run's own
+    path : the run directory; None: ``runs/<recording>``
+    data : folder of recordings to look in first
+    start, until, force : run from this stage on whether up to date or not; stop after this one; run every stage
+    progress : passes items through under a bar, as ``progress(items, label, total=None)``; tell : takes single lines
+
+    Raises SlamError for whatever the caller can mend, such as a recording that is not there or an option that is not known.
+    """
+    opened, dataset, resolved = _create(str(target), settings, config, path, data, progress)
+    _bring_up_to_date(opened, resolved, dataset, start=start, until=until, force=force, progress=progress, tell=tell)
+    return Run(opened)
+
+
+def open_run(path: str | os.PathLike[str] | None = None) -> "Run":
+    """Open the run directory `path`; None: the one that $SLAMCLI_RUN names, else the last one made here.
+
+    Raises SlamError where there is none.
+    """
+    return Run(RunDir.find(None if path is None else str(path)))
+
+
+class Run:
+    """A run: what each stage made, and what of it still holds. Reading never changes it; `update` and `run_stage` do."""
+
+    def __init__(self, directory: RunDir) -> None:
+        self.directory = directory
+
+    def __repr__(self) -> str:
+        return f"Run({str(self.path)!r})"
+
+    @property
+    def path(self) -> Path:
+        """The run directory."""
+        return self.directory.path
+
+    @property
+    def name(self) -> str:
+        """The recording's name."""
+        return str(self.directory.info()["dataset"])
+
+    def config(self) -> Config:
+        """Read the run's configuration."""
+        return self.directory.config()
+
+    def dataset(self) -> "Dataset":
+        """Open the recording; SlamError when it is not there any more."""
+        return self.directory.dataset()
+
+    # making
+
+    def update(
+        self,
+        *,
+        settings: Settings = (),
+        config: str | None = None,
+        start: str | None = None,
+        until: str | None = None,
+        force: bool = False,
+        progress: Progress = silent,
+        tell: Tell = log.info,
+    ) -> "Run":
+        """Change settings, if any are given, and run exactly the stages that need it; the arguments are those of `slamcli.run`."""
+        resolved = toml.resolve(self.config(), config, settings)
+        _bring_up_to_date(self.directory, resolved, None, start=start, until=until, force=force, progress=progress, tell=tell)
+        return self
+
+    def run_stage(self, stage: str, *, settings: Settings = (), progress: Progress = silent, tell: Tell = log.info) -> "Run":
+        """Run one stage alone, even when it is up to date, from whatever its predecessors left."""
+        resolved = toml.resolve(self.config(), None, settings)
+        with _writing(self.directory, resolved):
+            Pipeline(self.directory, resolved, progress=progress, tell=tell).run_alone(stage)
+        return self
+
+    # what holds
+
+    def status(self, *, settings: Settings = (), config: str | None = None, verify: bool = False) -> dict[str, State]:
+        """Judge every stage: up to date, stale and why, missing or damaged.
+
+        settings, config : judge as if these had been given; nothing is changed
+        verify : read every file again and compare its digest
+        """
+        return Pipeline(self.directory, toml.resolve(self.config(), config, settings)).states(verify=verify)
+
+    def record(self, stage: str) -> dict[str, Any] | None:
+        """Read what a stage said of itself: configuration, inputs, outputs, cost, warnings; None before it was run."""
+        return self.directory.record(stage)
+
+    def summary(self) -> dict[str, dict[str, Any]]:
+        """Give the figures that each finished stage counted, by stage."""
+        return {name: record["summary"] for name in NAMES if (record := self.record(name)) is not None}
+
+    # what was made
+
+    def camera(self, stage: str = "loop") -> "Camera":
+        """Read the intrinsics that extract used, or those known after optimize or loop."""
+        return self.directory.camera(stage)
+
+    def trajectory(self, stage: str | None = None, *, frame: Literal["world", "level"] = "world") -> "Trajectory":
+        """Read the poses of all frames that have one after track, optimize or loop; None: the last of these there is.
+
+        frame : world, or level: z up, floor at z = 0
+        """
+        from slamcli.evaluation import trajectory_error
+        from slamcli.schema import Trajectory
+
+        found = trajectory_error.stage_trajectory(self.directory, stage or trajectory_error.last_stage(self.directory))
+        return Trajectory(stamp=found.stamp, T_wc=self.ground().T_lw @ found.T_wc) if frame == "level" else found
+
+    def cloud(self) -> "Points":
+        """Read the dense cloud in the level frame: xyz (N, 3) [m], rgb (N, 3) uint8, normal (N, 3)."""
+        from slamcli.formats import cloud
+
+        return cloud.read_ply(self.directory.stage_path("densify", "cloud.ply"))
+
+    def ground(self) -> "Ground":
+        """Read the floor and the level frame."""
+        from slamcli.schema import Ground
+
+        return self.directory.load(Ground, "densify")
+
+    def octree(self) -> "Octree":
+        """Read the octree of occupied and free space in the level frame."""
+        from slamcli.formats import octomap
+
+        return octomap.read(self.directory.stage_path("octree", "map.ot"))
+
+    def grid(self) -> "Grid":
+        """Read the navigation grid in the level frame."""
+        from slamcli.schema import Grid
+
+        return self.directory.load(Grid, "grid2d")
+
+    def ape(self, stage: str | None = None) -> "Ape":
+        """Measure the absolute pose error after a stage (None: the last there is); SlamError without ground truth."""
+        from slamcli.evaluation import trajectory_error
+
+        stage = stage or trajectory_error.last_stage(self.directory)
+        truth = trajectory_error.ground_truth(self.directory)
+        return trajectory_error.ape(self.trajectory(stage), truth, n_frames=self._n_frames(), name=self.name, stage=stage)
+
+    def rpe(self, stage: str | None = None, *, seconds: float | None = 1.0) -> "Rpe":
+        """Measure the relative pose error over an interval, or from one frame to the next where that is None."""
+        from slamcli.evaluation import trajectory_error
+        from slamcli.schema import Features
+
+        stage = stage or trajectory_error.last_stage(self.directory)
+        truth, stamp = trajectory_error.ground_truth(self.directory), self.directory.load(Features, "extract").stamp
+        return trajectory_error.rpe(self.trajectory(stage), truth, frame_stamp=stamp, name=self.name, stage=stage, seconds=seconds)
+
+    def _n_frames(self) -> int:
+        from slamcli.schema import Features
+
+        return len(self.directory.load(Features, "extract").stamp)
+
+    def report(self, path: str | os.PathLike[str] | None = None) -> Path:
+        """Write one self-contained HTML page about the run, to ``report.html`` in its directory unless `path` is given."""
+        from slamcli import report
+
+        target = Path(path) if path is not None else self.path / "report.html"
+        report.make(self.directory, target)
+        return target
+
+
+def _create(
+    target: str, settings: Settings, config: str | None, path: str | os.PathLike[str] | None, data: str | None, progress: Progress
+) -> "tuple[RunDir, Dataset, Config]":
+    """Open the recording and make or open its run."""
+    from slamcli.datasets import open_dataset
+
+    def opened(resolved: Config) -> "Dataset":
+        return open_dataset(target, data=data, camera=dict(resolved.camera) or None, progress=progress)
+
+    settings = settings if isinstance(settings, Mapping) else tuple(settings)
+    first = toml.resolve(RunDir(Path(path)).config() if path is not None else None, config, settings)
+    dataset = opened(first)
+    place = Path(path) if path is not None else default_path(dataset.name)
+    resolved = toml.resolve(RunDir(place).config(), config, settings)
+    if resolved.camera != first.camera:  # only now is it known that an earlier command gave this run another camera
+        dataset = opened(resolved)
+    directory = RunDir.create(place, dataset=dataset.name, root=str(dataset.root.resolve()), digest=dataset.digest())
+    return directory, dataset, resolved
+
+
+def _bring_up_to_date(
+    directory: RunDir, config: Config, dataset: "Dataset | None", *, progress: Progress, tell: Tell, **which: Any
+) -> None:
+    with _writing(directory, config):
+        directory.mark_latest()
+        Pipeline(directory, config, dataset=dataset, progress=progress, tell=tell).bring_up_to_date(**which)
+
+
+@contextmanager
+def _writing(directory: RunDir, config: Config) -> Iterator[None]:
+    """Lock the run, log to its file, and make `config` its configuration."""
+    with directory.lock(), log_file(directory.path / "log.txt"):
+        directory.write_config(config)
+        yield

@@ -1,0 +1,111 @@
+"""Which sources a stage can reach, and their digests: a result is stale when one of them has changed.
+
+Followed are the import statements of the text, wherever in a file they stand, from the stage's own file on. Nothing is imported for it
+and nothing is parsed as a whole: `slamcli status` asks this each time.
+"""
+
+import functools
+import hashlib
+import re
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+from slamcli.stages import stage_named
+
+PACKAGE = Path(__file__).parents[1]
+DIGITS = 12  # hexadecimal, of a file's digest: chance equality of two states of a file is out of the question
+SHOWN = 3  # changed files that a reason names
+READING = "datasets/__init__.py"  # through it the pipeline opens the recording for a stage that needs one
+
+# Reached by imports, yet without influence on what a stage computes from its inputs.
+APART = frozenset(
+    {
+        "__init__.py",  # the API's names
+        "stages/__init__.py",  # the table: what of it matters to a stage, its needs and its sections, is in the key itself
+        "config/options.py",  # declares the options, whose values are in the key
+        "console.py",  # what the user sees
+        "jit/cache.py",  # where machine code is kept
+        "jit/compilation.py",  # when it is compiled
+        "user_cache.py",
+        "datasets/demo.py",  # makes a recording, which is known by its own digest
+        "datasets/download.py",  # likewise
+    }
+)
+
+FOR_TYPE_CHECKERS = re.compile(r"^( *)if TYPE_CHECKING:\n(?:\1 +.*\n|\n)+", re.MULTILINE)
+IMPORT = re.compile(r"^ *(?:from +(slamcli[\w.]*) +import +(\([^)]*\)|.*)|import +(slamcli[\w.]*))", re.MULTILINE)
+
+
+@functools.cache
+def of_stage(name: str) -> Mapping[str, str]:
+    """Return the digest of every file that a stage can reach, by its name within the package. They are read once a process."""
+    start = [f"stages/{name}.py"] + ([READING] if "dataset" in stage_named(name).needs else [])
+    return {file: _digest(file) for file in sorted(reachable(start))}
+
+
+def changes(recorded: Mapping[str, str], now: Mapping[str, str]) -> str:
+    """Say which files differ between two states, such as "slam/tracker.py changed"; "" where none does."""
+    if not recorded:
+        return "its sources were not recorded"
+    changed = sorted(file for file in recorded.keys() | now.keys() if recorded.get(file) != now.get(file))
+    if not changed:
+        return ""
+    more = f" and {len(changed) - SHOWN} more" if len(changed) > SHOWN else ""
+    return f"{', '.join(changed[:SHOWN])}{more} changed"
+
+
+def reachable(start: list[str]) -> set[str]:
+    """List the files that these import, directly or through others, themselves included, and the data files that they name."""
+    found, open_ = set(start), list(start)
+    while open_:
+        for file in imported(open_.pop()):
+            if file not in found and file not in APART:
+                found.add(file)
+                open_.append(file)
+    return found | {data for file in found for data in _data_named_in(file)}
+
+
+@functools.cache
+def imported(file: str) -> frozenset[str]:
+    """List the files of this package that a file imports; what only type checkers see is left out."""
+    return frozenset(path for module in _modules(_text(file)) for path in _files_of(module))
+
+
+def _modules(text: str) -> Iterator[str]:
+    """Give the dotted names that import statements mention; of ``from a import b`` both a and a.b, which may be no module."""
+    for statement in IMPORT.finditer(FOR_TYPE_CHECKERS.sub("", text)):
+        home, names, plain = statement.groups()
+        if plain:
+            yield plain
+        else:
+            yield home
+            yield from (f"{home}.{name.split()[0]}" for name in names.split("#")[0].strip("() \n").split(",") if name.strip())
+
+
+@functools.cache
+def _files_of(module: str) -> tuple[str, ...]:
+    """Give the file of a module, after those of the packages it lies in; what is no module gives those alone."""
+    parts = module.split(".")[1:]
+    packages = ["/".join([*parts[:k], "__init__.py"]) for k in range(len(parts) + 1)]
+    return tuple(file for file in [*packages, "/".join(parts) + ".py"] if _is_file(file))
+
+
+@functools.cache
+def _is_file(file: str) -> bool:
+    return (PACKAGE / file).is_file()
+
+
+@functools.cache
+def _text(file: str) -> str:
+    return (PACKAGE / file).read_text(encoding="utf-8")
+
+
+@functools.cache
+def _data_named_in(file: str) -> tuple[str, ...]:
+    names = sorted(path.name for path in (PACKAGE / "data").glob("*") if path.is_file() and path.name in _text(file))
+    return tuple(f"data/{name}" for name in names)
+
+
+@functools.cache
+def _digest(file: str) -> str:
+    return hashlib.sha256((PACKAGE / file).read_bytes()).hexdigest()[:DIGITS]

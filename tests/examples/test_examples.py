@@ -1,0 +1,77 @@
+"""The examples run as they stand, on a small room instead of the demo."""
+
+import importlib.util
+import json
+import os
+import runpy
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from slamcli.datasets import silent
+from slamcli.datasets.simulate import simulate
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+EXECUTE = """
+import sys, nbformat
+from nbclient import NotebookClient
+notebook = nbformat.read(sys.argv[1], as_version=4)
+NotebookClient(notebook, timeout=300, kernel_name="python3").execute()
+for cell in notebook.cells:
+    for output in cell.get("outputs", ()):
+        print(output.get("text") or output.get("data", {}).get("text/plain"))
+"""
+
+
+@pytest.fixture
+def play(here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture):
+    """Run a script of the folder in an empty current folder; gives what it printed."""
+    monkeypatch.setenv("MPLBACKEND", "Agg")
+
+    def play(name: str, *arguments: object) -> str:
+        monkeypatch.setattr(sys, "argv", [name, *map(str, arguments)])
+        runpy.run_path(str(EXAMPLES / name), run_name="__main__")
+        return capsys.readouterr().out
+
+    return play
+
+
+def test_plot_run_draws_a_picture(play, here: Path, room: Path) -> None:
+    assert play("plot_run.py", room, here / "run.png").strip() == str(here / "run.png")
+    assert (here / "run.png").stat().st_size > 5000
+
+
+def test_compare_setting_prints_a_line_of_each_run_and_the_setting_matters(play, room: Path) -> None:
+    before, after = play("compare_setting.py", room, "extract.features=300", "both").splitlines()
+    assert before.startswith("default") and after.startswith("extract.features=300")
+    assert before.split("APE")[1] != after.split("APE")[1]
+    assert "of 40 frames" in before
+
+
+def test_plan_path_stays_in_the_room(play, here: Path) -> None:
+    recording = simulate(here / "floor", progress=silent, frames=30, laps=0.2, width=160, height=120, pitch=-35.0, noise="none")
+    first, *points = play("plan_path.py", recording).splitlines()
+    assert 0.1 < float(first.split()[0]) < 10.0
+    assert len(points) >= 2
+    assert all(abs(float(value)) < 10.0 for point in points for value in point.split())
+
+
+def test_plan_path_says_so_when_there_is_no_floor_to_drive_on(play, room: Path) -> None:
+    with pytest.raises(SystemExit, match="no free place"):
+        play("plan_path.py", room)
+
+
+def test_the_notebook_runs(here: Path, room: Path) -> None:
+    if importlib.util.find_spec("nbclient") and importlib.util.find_spec("ipykernel"):
+        command = [sys.executable, "-c", EXECUTE, str(EXAMPLES / "tour.ipynb")]
+    else:  # its cells one after another: what a kernel would do, without a kernel
+        cells = json.loads((EXAMPLES / "tour.ipynb").read_text())["cells"]
+        code = "\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "code")
+        command = [sys.executable, "-c", code]
+    environment = {**os.environ, "RECORDING": str(room), "MPLBACKEND": "Agg", "PYTHONPATH": os.pathsep.join(sys.path)}
+    done = subprocess.run(command, cwd=here, env=environment, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    assert "grid2d" in done.stdout
+    assert (here / "runs" / "tour" / "report.html").is_file()
