@@ -14,8 +14,8 @@ from slamcli.errors import BadFrame, SlamError
 from slamcli.geometry.camera import Camera
 from slamcli.parallel import ordered_map
 from slamcli.schema import CoarseDepth, Features, Flow
+from slamcli.stages.camera_file import write_camera
 from slamcli.stages.contract import Inputs, Summary, Tools
-from slamcli.stages.map_outputs import write_camera
 from slamcli.vision import optical_flow, orb
 
 

@@ -14,14 +14,15 @@ from slamcli.errors import SlamError
 from slamcli.formats.g2o import write_g2o
 from slamcli.geometry.camera import Camera
 from slamcli.schema import LOST, Closures, CoarseDepth, Features, Map, Timing, Tracks, Words
-from slamcli.slam import final_refinement, loop_closing, map_segments
+from slamcli.slam import final_refinement, loop_closing, map_merging, map_segments
 from slamcli.slam.depth_tracking import Reliefs
 from slamcli.slam.loop_closing import Candidate
 from slamcli.slam.place_recognition import PlaceIndex
 from slamcli.sparse_map import map_adjustment
 from slamcli.sparse_map.sparse_map import MapBuilder
+from slamcli.stages.camera_file import write_camera
 from slamcli.stages.contract import Inputs, Summary, Tools
-from slamcli.stages.map_outputs import describe_other_segments, save_map, segment_file, write_camera
+from slamcli.stages.map_outputs import describe_other_segments, save_map, segment_file
 
 
 def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
@@ -133,8 +134,8 @@ def join_segments(
     tried = [loop_closing.verify(builder, places.words, c, camera, cfg.loop, cfg.sensor, rng) for c in between]
     fate = [c for c in tried if not c.is_accepted]
     left = [c for c in tried if c.is_accepted]
-    while found := map_segments.find_join(builder, left, least=cfg.loop.join_closures):
-        map_segments.join(builder, found)
+    while found := map_merging.find_join(builder, left, least=cfg.loop.join_closures):
+        map_merging.join(builder, found)
         settle(builder, loop_closing.spread(found.closures, span=cfg.loop.closure_spacing), camera, cfg)
         fate += found.closures
         # What says otherwise is tried again like any loop, now that odometry of a kind runs between the segments.

@@ -1,13 +1,11 @@
-"""The files that track, optimize and loop have in common: the map, the trajectories, and what is known of the camera."""
+"""The files that track, optimize and loop have in common: the map and the trajectories."""
 
-import json
 from pathlib import Path
 
 import numpy as np
 
 from slamcli import artifacts
 from slamcli.formats import trajectory as trajectory_file
-from slamcli.geometry.camera import Camera
 from slamcli.schema import Map, Tracks, Trajectory, frame_segments, trajectory
 from slamcli.slam import map_segments
 
@@ -45,8 +43,3 @@ def describe_other_segments(tracks: Tracks, map_: Map) -> list[str]:
             f"map segment {segment}, {len(of)} of the frames {of[0]} to {of[-1]}" if len(of) else f"map segment {segment}, no frame"
         )
     return described
-
-
-def write_camera(out: Path, camera: Camera) -> None:
-    """Write `camera.json`: the recording's calibration, and in later stages what is known of the camera by then."""
-    (out / "camera.json").write_text(json.dumps(camera.to_dict(), indent=2) + "\n")

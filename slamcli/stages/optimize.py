@@ -15,8 +15,9 @@ from slamcli.slam import final_refinement, map_segments
 from slamcli.slam.depth_tracking import NO_RELIEFS, Reliefs
 from slamcli.sparse_map import map_adjustment
 from slamcli.sparse_map.sparse_map import MapBuilder
+from slamcli.stages.camera_file import write_camera
 from slamcli.stages.contract import Inputs, Summary, Tools
-from slamcli.stages.map_outputs import save_map, write_camera
+from slamcli.stages.map_outputs import save_map
 
 
 def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:

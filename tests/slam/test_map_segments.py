@@ -12,7 +12,7 @@ from slamcli.errors import SlamError
 from slamcli.formats.trajectory import read_tum
 from slamcli.geometry import se3
 from slamcli.schema import LOST, RELOCALISED, Map, Tracks, frame_poses, frame_segments, trajectory
-from slamcli.slam import map_segments
+from slamcli.slam import map_merging, map_segments
 from slamcli.slam.loop_closing import Candidate
 from slamcli.sparse_map import map_adjustment
 from slamcli.sparse_map.sparse_map import MapBuilder
@@ -170,18 +170,18 @@ def test_closures_that_agree_join_and_the_one_that_does_not_is_left_out():
     builder, T_gc, T_ab = two_segments(np.random.default_rng(1))
     true = [measured(T_gc, 3, 1, [0.004, 0, 0, 0, 0.002, 0]), measured(T_gc, 4, 2), measured(T_gc, 5, 0)]
     false = measured(T_gc, 5, 2, [0.5, 0, 0.2, 0, 0.3, 0])
-    found = map_segments.find_join(builder, [*true, false], least=2)
+    found = map_merging.find_join(builder, [*true, false], least=2)
     assert found.closures == true
     np.testing.assert_allclose(found.T_ab, T_ab, atol=0.02)
-    map_segments.join(builder, found)
+    map_merging.join(builder, found)
     assert (builder.kf.segment == 0).all()
     np.testing.assert_allclose(builder.kf.T_wk, T_gc, atol=0.03)
 
 
 def test_one_closure_alone_joins_nothing():
     builder, T_gc, _ = two_segments(np.random.default_rng(2))
-    assert map_segments.find_join(builder, [measured(T_gc, 3, 1)], least=2) is None
-    assert map_segments.find_join(builder, [measured(T_gc, 3, 1)], least=1) is not None
+    assert map_merging.find_join(builder, [measured(T_gc, 3, 1)], least=2) is None
+    assert map_merging.find_join(builder, [measured(T_gc, 3, 1)], least=1) is not None
 
 
 @pytest.mark.parametrize(("n_inliers", "is_joined"), [(60, False), (30, True)])
@@ -191,7 +191,7 @@ def test_what_looks_alike_in_two_places_joins_nothing(n_inliers, is_joined):
     next_door = se3.exp(np.array([2.0, 0, 0, 0, 0, 0]))
     alike = [measured(T_gc, i, 0, n_inliers=n_inliers) for i in (4, 5)]
     alike = [replace(c, T_ij=se3.inverse(T_gc[c.kf_i]) @ next_door @ T_gc[c.kf_j]) for c in alike]
-    found = map_segments.find_join(builder, [*true, *alike], least=2)
+    found = map_merging.find_join(builder, [*true, *alike], least=2)
     assert (found is not None) == is_joined
 
 
