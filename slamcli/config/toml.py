@@ -3,18 +3,13 @@
 import dataclasses
 import difflib
 import math
-import sys
+import tomllib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, get_args, get_origin, get_type_hints
 
 from slamcli.config.options import Config
 from slamcli.errors import SlamError
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
 
 Settings = Mapping[str, Any] | Iterable[str]  # values by full name, or the texts that follow -s
 

@@ -2,17 +2,12 @@
 
 import json
 import re
-import sys
+import tomllib
 from pathlib import Path
 from typing import Any
 
 from slamcli.errors import SlamError
 from slamcli.geometry.camera import Camera
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
 
 # J. Sturm et al., A benchmark for the evaluation of RGB-D SLAM systems, IROS 2012, calibration page of the data set. The depth images are
 # already scaled, so the correction factors on that page must not be applied again; ORB-SLAM2 found another 4 % on freiburg2 (5208).

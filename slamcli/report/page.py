@@ -5,7 +5,7 @@ import json
 import platform
 import re
 from dataclasses import asdict
-from datetime import datetime, timezone
+from datetime import UTC, datetime
 from importlib import resources
 from typing import Any
 
@@ -35,7 +35,7 @@ def render(content: Content, pictures: list[Picture]) -> str:
         "recording": _pairs({"folder": content.recording["root"], **content.recording["camera"]}),
         "configuration": _configuration(content),
         "versions": _pairs(_versions(content)),
-        "made": datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC"),
+        "made": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
         "data": json.dumps(_data(content), separators=(",", ":"), allow_nan=False).replace("<", "\\u003c"),
         "style": _resource("page.css"),
         "script": _resource("page.js"),

@@ -11,7 +11,7 @@ import os
 import shutil
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from datetime import datetime, timezone
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -72,7 +72,7 @@ class RunDir:
             if run.path.is_dir() and any(not entry.name.startswith(".") for entry in run.path.iterdir()):
                 raise SlamError(f"{path}: the folder is not empty and not a run directory; name another with -r")
             run.path.mkdir(parents=True, exist_ok=True)
-            now = datetime.now(timezone.utc).isoformat(timespec="seconds")
+            now = datetime.now(UTC).isoformat(timespec="seconds")
             run._write_info({"format": FORMAT, "dataset": dataset, "root": root, "digest": digest, "created": now})
             return run
         info = run._checked().info()
