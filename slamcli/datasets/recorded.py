@@ -1,5 +1,6 @@
 """What a reader finds in a recording, before clocks are judged, images paired and calibrations completed."""
 
+import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -56,6 +57,16 @@ def truth_file(path: Path) -> Truth | None:
     return read
 
 
+def poses_by_number(path: Path, files: dict[int, str], numbers: list[int | None]) -> np.ndarray:
+    """Read one pose file of 4 x 4 for each number, (N, 4, 4), NaN where there is none or it cannot be read."""
+    poses = np.full((len(numbers), 4, 4), np.nan)
+    for row, number in enumerate(numbers):
+        if number is not None and number in files:
+            with contextlib.suppress(SlamError):
+                poses[row] = read_matrices(path / files[number])[0]
+    return poses
+
+
 def truth_of_rows(T_wc: np.ndarray) -> Truth:
     """Give the truth as one pose for each row of colour, (N, 4, 4), not finite = unknown."""
 
@@ -65,6 +76,11 @@ def truth_of_rows(T_wc: np.ndarray) -> Truth:
         return Trajectory(stamp=clock.stamp[is_known], T_wc=poses[is_known]) if is_known.any() else None
 
     return read
+
+
+def truth_when_asked(load: Callable[[], np.ndarray]) -> Truth:
+    """Give the truth that `load` reads when somebody asks for it: one pose for each row of colour, (N, 4, 4), not finite = unknown."""
+    return lambda clock: truth_of_rows(load())(clock)
 
 
 def truth_of_columns(rows: np.ndarray) -> Truth:

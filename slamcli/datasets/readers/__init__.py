@@ -38,7 +38,24 @@ class Reader:
 
 
 # The more telling first: a folder is read by the first that recognises it.
-READERS = (Reader("tum", "TUM RGB-D, ETH3D-SLAM, Bonn", "rgb.txt and depth.txt"),)
+READERS = (
+    Reader("r3d", "Record3D's own file", "suffix .r3d", "phone"),
+    Reader("sens", "ScanNet's .sens", "suffix .sens"),
+    Reader("rtabmap_db", "RTAB-Map's database", "suffix .db, SQLite"),
+    Reader("rosbag", "ROS 1 bag, ROS 2 bag, MCAP", ".bag, .mcap, .db3, or a folder with metadata.yaml"),
+    Reader("tum", "TUM RGB-D, ETH3D-SLAM, Bonn", "rgb.txt and depth.txt"),
+    Reader("record3d", "Record3D's export", "metadata.json, rgb/ and depth/", "phone"),
+    Reader("strayscanner", "StrayScanner", "odometry.csv, rgb.mp4 and depth/", "video"),
+    Reader("transforms", "nerfstudio, Polycam, NeRFCapture", "transforms.json with depth"),
+    Reader("open3d", "Open3D's recorder", "camera_intrinsic.json, color/ and depth/"),
+    Reader("scannet", "ScanNet, extracted", "intrinsic/intrinsic_color.txt, color/ and depth/"),
+    Reader("replica", "Replica as NICE-SLAM has it", "results/frame*.jpg and results/depth*.png"),
+    Reader("seven_scenes", "7-Scenes, tsdf-fusion", "frame-*.color.png or .jpg, frame-*.depth.png"),
+    Reader("icl_nuim", "ICL-NUIM", "*.gt.freiburg beside lists or folders of images"),
+    Reader("rtabmap", "RTAB-Map's export", "calib/, rgb/ and depth/"),
+    Reader("associations", "pairs in one list", "associations.txt, associate.txt, assoc.txt ..."),
+    Reader("numbered", "numbered images", "rgb/, color/ or image/ and depth/ with equal numbers"),
+)
 
 
 def reader_of(path: Path) -> Reader | None:
