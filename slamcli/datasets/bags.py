@@ -8,6 +8,7 @@ import os
 import sqlite3
 import struct
 import threading
+import weakref
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -45,26 +46,55 @@ class Bag(Protocol):
 
 def open_bag(path: Path) -> Bag:
     """Open a bag; SlamError says what is wrong with it."""
-    from rosbags.rosbag1 import Reader as Reader1
     from rosbags.rosbag1 import ReaderError as Reader1Error
-    from rosbags.rosbag2 import Reader as Reader2
     from rosbags.rosbag2 import ReaderError as Reader2Error
 
     try:
-        if path.suffix.lower() == ".bag":
-            reader = Reader1(path)
-            reader.open()
-            return Bag1(path, reader)
-        reader = Reader2(path)
-        reader.open()
-        return _bag2(path, reader)
+        return _bag1(path) if path.suffix.lower() == ".bag" else _bag2(path)
+    except SlamError:
+        raise
     except (Reader1Error, Reader2Error) as error:
         advice = "; repair it with `rosbag reindex`" if "not indexed" in str(error) else "; is it cut off, or still being recorded?"
-        raise SlamError(f"{path}: cannot be read as a bag: {error}{advice}") from error
-    except FileNotFoundError as error:
-        raise SlamError(f"{path}: {error}") from error
+        raise SlamError(f"{path}: cannot be read as a bag: {_one_line(error)}{advice}") from error
     except Exception as error:  # the package meets hostile bytes with assertions and whatever its parsers raise
-        raise SlamError(f"{path}: cannot be read as a bag; is it cut off? ({type(error).__name__}: {error})") from error
+        raise SlamError(f"{path}: cannot be read as a bag; is it cut off? ({type(error).__name__}: {_one_line(error)})") from error
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())[:300]
+
+
+def _bag1(path: Path) -> "Bag1":
+    from rosbags.rosbag1 import Reader
+
+    with Reader(path) as reader:
+        return Bag1(path, reader)
+
+
+def _bag2(path: Path) -> "Bag2":
+    """Put the files of a ROS 2 bag together. A reader that unpacked whole files stays open, as they vanish with it."""
+    from rosbags.rosbag2 import Reader
+
+    reader = Reader(path)
+    reader.open()
+    is_unpacked = False
+    try:
+        storages = list(getattr(reader.storage, "storages", [reader.storage]))
+        mode = getattr(reader, "compression_mode", None)
+        is_unpacked = mode == "file"
+        parts: list[Any] = [McapFile(s) if type(s).__name__ == "McapReader" else SqliteFile(s) for s in storages]
+        if not parts:
+            raise SlamError(f"{path}: names no file with messages")
+        bag = Bag2(path, parts, is_packed=mode == "message")
+    except BaseException:
+        is_unpacked = False
+        raise
+    finally:
+        if not is_unpacked:
+            reader.close()
+    if is_unpacked:
+        weakref.finalize(bag, reader.close)
+    return bag
 
 
 class _Parts:
@@ -73,6 +103,7 @@ class _Parts:
     def __init__(self, path: Path) -> None:
         self.path = path
         self._file = os.open(path, os.O_RDONLY)
+        self._size = os.fstat(self._file).st_size
         self._lock = threading.Lock()
         self._kept: OrderedDict[int, bytes] = OrderedDict()
 
@@ -80,8 +111,8 @@ class _Parts:
         os.close(self._file)
 
     def at(self, start: int, n: int) -> bytes:
-        """Read n bytes at a place in the file."""
-        return os.pread(self._file, n, start)
+        """Read n bytes at a place in the file, fewer at its end."""
+        return os.pread(self._file, min(n, self._size - start), start) if 0 <= start < self._size and n > 0 else b""
 
     def unpacked(self, key: int, unpack: Callable[[], bytes]) -> bytes:
         """Give a part, unpacked once for messages that follow each other."""
@@ -120,7 +151,6 @@ class Bag1:
             if before is not None:
                 messages = sorted(before.messages + messages)
             self.topics[connection.topic] = Topic(connection.topic, connection.msgtype, messages)
-        reader.close()
 
     def read(self, place: tuple[int, int], n: int | None = None) -> bytes:
         """Read the record at an offset of a chunk; records of connections before it are passed over."""
@@ -163,24 +193,13 @@ def _plain_decompressor(reader: Any) -> Any:
     return module.decompressors["none"]
 
 
-def _bag2(path: Path, reader: Any) -> Bag:
-    """Put the files of a ROS 2 bag together."""
-    storage = reader.storage
-    storages = list(getattr(storage, "storages", [storage]))
-    mode = getattr(reader, "compression_mode", None)
-    if not storages:
-        raise SlamError(f"{path}: names no file with messages")
-    parts = [McapFile(s) if type(s).__name__ == "McapReader" else SqliteFile(s) for s in storages]
-    return Bag2(path, parts, reader, is_packed=mode == "message")
-
-
 class Bag2:
     """ROS 2: one or more files."""
 
     is_cdr = True
 
-    def __init__(self, path: Path, parts: list[Any], reader: Any, *, is_packed: bool) -> None:
-        self.path, self._files, self._is_packed, self._reader = path, parts, is_packed, reader
+    def __init__(self, path: Path, parts: list[Any], *, is_packed: bool) -> None:
+        self.path, self._files, self._is_packed = path, parts, is_packed
         self.is_slow = any(part.is_slow for part in parts)
         found: dict[str, tuple[str, list[tuple[int, Any]]]] = {}
         for number, part in enumerate(parts):
@@ -242,14 +261,15 @@ class McapFile:
     def __init__(self, storage: Any) -> None:
         self.path = Path(storage.path)
         self._parts = _Parts(self.path)
-        self._storage = storage
+        self._channels = {c.id: (c.topic, c.msgtype) for c in storage.connections}
+        self._range = storage.data_start, storage.data_end
         self._chunks = {chunk.chunk_start_offset: chunk for chunk in storage.chunks}
         packed = [chunk.compressed_size for chunk in self._chunks.values() if chunk.compression]
         self.is_slow = sum(packed) > MOST_PACKED
 
     def topics(self) -> list[tuple[str, str, list[tuple[int, tuple[int, int]]]]]:
         """List the messages of each topic."""
-        channels = {c.id: (c.topic, c.msgtype) for c in self._storage.connections}
+        channels = self._channels
         found: dict[int, list[tuple[int, tuple[int, int]]]] = {key: [] for key in channels}
         if self._chunks and all(chunk.message_index_offsets for chunk in self._chunks.values()):
             for chunk in self._chunks.values():
@@ -302,7 +322,7 @@ class McapFile:
 
     def _scan(self, found: dict[int, list[tuple[int, tuple[int, int]]]]) -> None:
         """Find messages without an index by walking over the file."""
-        at, end = self._storage.data_start, self._storage.data_end
+        at, end = self._range
         while at + 9 <= end:
             head = self._parts.at(at, 31)
             (size,) = struct.unpack_from("<Q", head, 1)

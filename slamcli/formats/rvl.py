@@ -54,7 +54,7 @@ def number(data, at, nibbles):
     value, shift = 0, 0
     while at < nibbles:
         word, place = at >> 3, at & 7
-        byte = data[4 * word + 3 - (place >> 1)]
+        byte = i8(data[4 * word + 3 - (place >> 1)])
         nibble = (byte >> 4) if place & 1 == 0 else (byte & 15)
         at += 1
         value |= (nibble & 7) << shift
