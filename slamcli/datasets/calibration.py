@@ -94,7 +94,7 @@ def complete(
     if size is not None and "width" not in values and "height" not in values and not missing:
         values = _sized(values, size, source)
     whole = {key: int(values[key]) for key in ("width", "height") if isinstance(values.get(key), float) and values[key].is_integer()}
-    camera = Camera.from_dict({**values, **whole}, source=source or str(root))
+    camera = Camera.from_dict({**values, **whole}, source=source if str(root) in source else f"{root}: {source}")
     return camera if size is None else fitted(camera, size, root)
 
 

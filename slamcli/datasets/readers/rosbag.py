@@ -34,7 +34,11 @@ def recognises(path: Path) -> bool:
 
 def read(path: Path) -> Recorded:
     """Choose the topics and index their messages."""
-    bag = open_bag(path)
+    return of_bag(open_bag(path), path, reader="rosbag")
+
+
+def of_bag(bag: Bag, path: Path, *, reader: str) -> Recorded:
+    """Find the two topics of images, their stamps, intrinsics and transform."""
     said: list[str] = []
     colour, picture = _choose(bag, path, "colour", said)
     depth, depth_image = _choose(bag, path, "depth", said)
@@ -50,7 +54,7 @@ def read(path: Path) -> Recorded:
         calibration = Calibration(calibration.values, calibration.source, intrinsics(depth_info), T_cd)
     is_float = depth_image.encoding.lower().startswith(("32fc1", "64fc1"))
     return Recorded(
-        reader="rosbag",
+        reader=reader,
         root=path,
         colour=Stream(colour_images, stamp, f"{path}:{colour.name}"),
         depth=Stream(depth_images, depth_stamp, f"{path}:{depth.name}"),
@@ -103,7 +107,7 @@ def _info(bag: Bag, name: str, message: Image) -> CameraInfo | None:
     """Find the CameraInfo that belongs to a topic: in its namespace, else of its frame, else the only one there is."""
     topics = [topic for topic in bag.topics.values() if topic.kind == INFO and topic.messages]
     spaces = [name.rsplit("/", depth)[0] for depth in (1, 2, 3) if name.count("/") > depth]
-    near = [topic for space in spaces for topic in topics if topic.name == f"{space}/camera_info"]
+    near = [t for space in spaces for t in topics if t.name in (f"{space}/camera_info", f"{space}/info/camera_info")]
     known = [info for topic in [*near, *topics] if (info := _read_info(bag, topic)) is not None]
     if near and known:
         return known[0]
