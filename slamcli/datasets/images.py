@@ -45,6 +45,8 @@ TO_GREY_AND_RGB: dict[str, tuple[int | None, int | None]] = {
     "nv12": (cv2.COLOR_YUV2GRAY_NV12, cv2.COLOR_YUV2RGB_NV12),
 }
 PLANAR = ("yuv420p", "nv12")  # rows of luma, then half as many of chroma
+LIMITED = ("yuv420p", "nv12", "yuv422", "uyvy", "yuv422_yuy2", "yuyv")  # luma from 16, black, to 235, white: ITU-R BT.601
+FULL_RANGE = np.clip(np.rint((np.arange(256) - 16.0) * (255.0 / 219.0)), 0, 255).astype(np.uint8)
 
 
 @dataclass(frozen=True)
@@ -202,7 +204,8 @@ def _converted(picture: Pixels, which: int, size: tuple[int, int], name: str) ->
     if picture.size != size:
         raise _size_error(name, picture.size, size)
     code = TO_GREY_AND_RGB[picture.encoding][which]
-    return picture.data if code is None else cv2.cvtColor(picture.data, code)
+    image = picture.data if code is None else cv2.cvtColor(picture.data, code)
+    return cv2.LUT(image, FULL_RANGE) if which == 0 and picture.encoding in LIMITED else image
 
 
 def _power(reduction: int) -> int:

@@ -31,6 +31,9 @@ SYNONYMS = {
     "depth_scale": ("depth_scale", "scale", "png_depth_scale", "depthmapfactor", "depth_factor", "depth_map_factor", "depthscale"),
 }  # fmt: skip
 MATRICES = ("intrinsic_matrix", "k", "camera_matrix", "intrinsics", "intrinsic", "intrinsic_k", "cam_k", "camera_intrinsic")
+EQUIDISTANT_NAMES = ("equidistant", "fisheye", "kannala_brandt", "kannala_brandt4", "opencv_fisheye")
+POLYNOMIAL_NAMES = ("", "none", "plumb_bob", "rational_polynomial", "rational", "radtan", "opencv", "brown_conrady", "modified_brown_conrady",
+                    "inverse_brown_conrady")  # fmt: skip
 DISTORTIONS = ("distortion_coefficients", "d", "coeffs", "dist_coeffs", "distortion", "distortion_coeffs")
 
 
@@ -119,12 +122,11 @@ def from_numbers(numbers: list[float]) -> dict[str, Any]:
 
 def distortion(coefficients: list[float], model: str) -> dict[str, Any]:
     """Read distortion coefficients as ROS and OpenCV order them; SlamError for a model that is not known."""
-    model = model.lower()
-    if model in ("equidistant", "fisheye", "kannala_brandt", "kannala_brandt4", "opencv_fisheye"):
-        names = ("k1", "k2", "k3", "k4")
-        values = dict(zip(names, map(float, coefficients[:4]), strict=False))
-        return {**values, "lens": EQUIDISTANT} if any(values.values()) or model else values
-    if model not in ("", "none", "plumb_bob", "rational_polynomial", "rational", "radtan", "opencv", "brown_conrady", "inverse_brown_conrady", "distortion.brown_conrady"):  # fmt: skip
+    model = model.lower().replace(" ", "_").removeprefix("distortion.")
+    if model in EQUIDISTANT_NAMES:
+        values = dict(zip(("k1", "k2", "k3", "k4"), map(float, coefficients[:4]), strict=False))
+        return {**values, "lens": EQUIDISTANT}
+    if model not in POLYNOMIAL_NAMES:
         raise SlamError(f"distortion model {model!r} is not known; known are plumb_bob, rational_polynomial and equidistant")
     return {name: float(value) for name, value in zip(COEFFICIENTS, coefficients, strict=False) if value != 0.0}
 

@@ -13,7 +13,13 @@ from slamcli.errors import BadFrame, SlamError
 from slamcli.formats import ros_messages, rvl
 from slamcli.formats.ros_messages import Image
 
-DEPTH_TYPES = {"16uc1": np.dtype("u2"), "mono16": np.dtype("u2"), "z16": np.dtype("u2"), "32fc1": np.dtype("f4"), "64fc1": np.dtype("f8")}
+DEPTH_TYPES: dict[str, np.dtype] = {
+    "16uc1": np.dtype("u2"),
+    "mono16": np.dtype("u2"),
+    "z16": np.dtype("u2"),
+    "32fc1": np.dtype("f4"),
+    "64fc1": np.dtype("f8"),
+}
 CHANNELS = {"rgb8": 3, "bgr8": 3, "8uc3": 3, "rgba8": 4, "bgra8": 4, "8uc4": 4, "mono8": 1, "8uc1": 1,
             "yuv422": 2, "uyvy": 2, "yuv422_yuy2": 2, "yuyv": 2, "yuv422_uyvy": 2,
             "bayer_rggb8": 1, "bayer_bggr8": 1, "bayer_gbrg8": 1, "bayer_grbg8": 1}  # fmt: skip

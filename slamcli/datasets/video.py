@@ -15,6 +15,7 @@ from slamcli.errors import BadFrame, SlamError
 KEPT = 12  # decoded frames: as many as threads may ask for out of order
 AHEAD = 90  # frames that are rather decoded in passing than sought
 MAX_FRAMES = 10_000_000
+FORMATS = {"yuv420p": "yuv420p", "rgb8": "rgb24", "mono16": "gray16le"}  # FFmpeg's names of ours
 
 
 def load_av(path: Path) -> Any:
@@ -57,8 +58,11 @@ class VideoFrames:
         """Give the size of the frame's packet."""
         return int(self._sizes[i]) if 0 <= i < len(self._sizes) else -1
 
-    def read(self, i: int) -> Pixels:
+    def read(self, i: int) -> Pixels | np.ndarray:
         """Decode frame i, and on the way those between it and the last one asked for."""
+        return self._frame(i)
+
+    def _frame(self, i: int) -> Pixels:
         with self._lock:
             if i in self._kept:
                 return self._kept[i]
@@ -88,7 +92,7 @@ class VideoFrames:
                 return self._kept[i]
 
     def _pixels(self, frame: Any) -> Pixels:
-        return Pixels(frame.to_ndarray(format=self._encoding), self._encoding)
+        return Pixels(frame.to_ndarray(format=FORMATS[self._encoding]), self._encoding)
 
     def _seek(self, i: int) -> None:
         if self._container is None:
@@ -111,7 +115,7 @@ class VideoFrames:
         """Find the time and size of every frame without decoding any."""
         with self._open() as container:
             stream = container.streams.video[self._track]
-            found = []
+            found: list[tuple[int, int]] = []
             try:
                 for packet in container.demux(stream):
                     if packet.pts is not None and packet.size and len(found) < MAX_FRAMES:
@@ -123,3 +127,14 @@ class VideoFrames:
                 raise SlamError(f"{self.path}: holds no video frame")
             table = np.array(sorted(found), dtype=np.int64)
             return table[:, 0], table[:, 1], stream.time_base
+
+
+class VideoDepth(VideoFrames):
+    """The frames of a track of 16-bit grey, as depth."""
+
+    def __init__(self, path: Path, *, track: int) -> None:
+        super().__init__(path, track=track, encoding="mono16")
+
+    def read(self, i: int) -> np.ndarray:
+        """Decode frame i, (h, w) uint16."""
+        return self._frame(i).data

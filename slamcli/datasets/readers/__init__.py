@@ -44,6 +44,7 @@ READERS = (
     Reader("rtabmap_db", "RTAB-Map's database", "suffix .db, SQLite"),
     Reader("realsense", "librealsense's recorder", ".bag or .db3 with topics /device_0/sensor_*"),
     Reader("rosbag", "ROS 1 bag, ROS 2 bag, MCAP", ".bag, .mcap, .db3, or a folder with metadata.yaml"),
+    Reader("azure_mkv", "Azure Kinect's recorder", "suffix .mkv", "video"),
     Reader("tum", "TUM RGB-D, ETH3D-SLAM, Bonn", "rgb.txt and depth.txt"),
     Reader("record3d", "Record3D's export", "metadata.json, rgb/ and depth/", "phone"),
     Reader("strayscanner", "StrayScanner", "odometry.csv, rgb.mp4 and depth/", "video"),

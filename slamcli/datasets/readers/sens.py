@@ -6,6 +6,7 @@ import zlib
 from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 
@@ -63,9 +64,9 @@ def read(path: Path) -> Recorded:
     )
 
 
-def _frames(file, size: int, n: int) -> list[tuple[np.ndarray, int, int, tuple[int, int], tuple[int, int]]]:
+def _frames(file: BinaryIO, size: int, n: int) -> list[tuple[np.ndarray, int, int, tuple[int, int], tuple[int, int]]]:
     """Find (pose, stamps of colour and depth, place and size of colour, of depth) of every frame that is there as a whole."""
-    found = []
+    found: list[tuple[np.ndarray, int, int, tuple[int, int], tuple[int, int]]] = []
     while len(found) < n:
         head = file.read(FRAME.size)
         if len(head) < FRAME.size:
