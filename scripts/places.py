@@ -19,8 +19,8 @@ import rivals
 import slamcli
 from slamcli import console
 from slamcli.console import table
+from slamcli.datasets.association import associate
 from slamcli.datasets.simulate import simulate
-from slamcli.datasets.tum import associate
 from slamcli.evaluation import trajectory_error
 from slamcli.geometry import se3
 from slamcli.runs.run_directory import RunDir

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from slamcli.datasets import Dataset, open_dataset
-from slamcli.datasets.tum import read_list
+from slamcli.datasets.lists import read_list
 from slamcli.formats.trajectory import write_tum
 from slamcli.schema import Trajectory
 

@@ -32,6 +32,22 @@ class RunConfig:
 
 
 @dataclass(frozen=True)
+class RecordingConfig:
+    """Which part of the recording is used, and how what it does not say is filled in; no stage declares it: it changes the recording."""
+
+    start: float = option(0.0, "time after the first frame at which to begin [s]", ge=0)
+    end: float = option(0.0, "time after the first frame at which to stop; 0 = at the last one [s]", ge=0)
+    every: int = option(1, "use every n-th frame", ge=1)
+    fps: float = option(0.0, "frame rate of a recording whose stamps are missing or no clock; 0 = 30 [Hz]", ge=0, le=1000)
+    known_camera: str = option(
+        "", 'name of a known camera whose nominal intrinsics are used, such as "kinect1" or "d435"; "" = the recording\'s own'
+    )
+    full_size: bool = option(
+        False, "use pictures of more than a megapixel as they are, instead of reduced to about 640 px: 3 to 9 times the time"
+    )
+
+
+@dataclass(frozen=True)
 class SensorConfig:
     """The depth camera's noise and what a measurement is worth; shared by track, optimize, loop."""
 
@@ -340,8 +356,9 @@ class Config:
     """Every section."""
 
     seed: int = option(0, "of every random draw: the same seed gives the same bytes", ge=0, le=2**63 - 1)
-    camera: dict[str, float] = field(default_factory=dict)  # what of the recording's calibration is overridden: keys of Camera
+    camera: dict[str, float | str] = field(default_factory=dict)  # what of the recording's calibration is overridden: keys of Camera
     run: RunConfig = field(default_factory=RunConfig)
+    recording: RecordingConfig = field(default_factory=RecordingConfig)
     sensor: SensorConfig = field(default_factory=SensorConfig)
     extract: ExtractConfig = field(default_factory=ExtractConfig)
     match: MatchConfig = field(default_factory=MatchConfig)

@@ -148,10 +148,10 @@ def _unknown(key: str, source: str) -> SlamError:
     return SlamError(f"{source}: {key} is not known; {hint}")
 
 
-def _camera_value(key: str, value: Any, source: str) -> float:
+def _camera_value(key: str, value: Any, source: str) -> float | str:
     if key not in _camera_keys():
         raise _unknown(f"camera.{key}", source)
-    expected = int if key in ("width", "height") else float
+    expected = {"width": int, "height": int, "lens": str}.get(key, float)
     return _typed(expected, value, _origin(f"camera.{key}", value, source))
 
 

@@ -1,24 +1,22 @@
-"""Recordings: find one by name, recognise its format, open it.
-
-A reader is a module with ``recognises(folder) -> bool`` and ``read(folder, *, name, camera) -> Dataset``; a new format is one file and one
-line in READERS.
-"""
+"""Recordings: find one by name, recognise its layout, open it."""
 
 import os
 import re
 from pathlib import Path
 from typing import Any
 
+from slamcli.config.options import RecordingConfig
 from slamcli.console import Progress, silent
-from slamcli.datasets import tum
-from slamcli.datasets.recording import Dataset
+from slamcli.datasets.assembly import assemble
+from slamcli.datasets.protocol import Dataset
+from slamcli.datasets.readers import READERS, reader_of
 from slamcli.errors import SlamError
 from slamcli.user_cache import user_cache
 
 __all__ = ["READERS", "Dataset", "open_dataset", "silent"]
 
-READERS = {"tum": tum}
 DEMO = "demo"
+ARCHIVES = (".zip", ".gz", ".tgz", ".tar", ".7z", ".rar", ".bz2", ".xz")
 
 # Names of the literature for recordings whose folders are called otherwise.
 ALIASES = {
@@ -27,20 +25,38 @@ ALIASES = {
 }
 
 
-def open_dataset(target: str, *, data: str | None = None, camera: dict[str, Any] | None = None, progress: Progress = silent) -> Dataset:
+def open_dataset(
+    target: str,
+    *,
+    data: str | None = None,
+    camera: dict[str, Any] | None = None,
+    options: RecordingConfig | None = None,
+    progress: Progress = silent,
+) -> Dataset:
     """Open a recording.
 
-    target : a folder, ``tum/fr1_room`` (or ``tum/rgbd_dataset_freiburg1_room``), or ``demo``
+    target : a folder or file, ``tum/fr1_room`` (or ``tum/rgbd_dataset_freiburg1_room``), or ``demo``
     data : folder to look in first; then $SLAMCLI_DATA, ./data and the user's cache
     camera : intrinsics that replace those found
+    options : which part of it to use, and what it is where it does not say so itself
 
     A recording of the TUM set that is nowhere is downloaded into the cache, the demo is rendered into it, both once.
     """
-    folder, name = _locate(str(target), data, progress)
-    for reader in READERS.values():
-        if reader.recognises(folder):
-            return reader.read(folder, name=name, camera=camera)
-    raise SlamError(f"{folder}: not a recording; a folder with rgb.txt and depth.txt (TUM layout) is expected")
+    path, name = _locate(str(target), data, progress)
+    reader = reader_of(path)
+    if reader is None:
+        raise SlamError(_not_a_recording(path))
+    return assemble(reader.read(path), name=name, camera=camera, options=options)
+
+
+def _not_a_recording(path: Path) -> str:
+    if path.suffix.lower() in ARCHIVES:
+        return f"{path}: an archive; unpack it and give the folder of the recording"
+    if path.is_file():
+        return f"{path}: not a recording; give the folder of one, or a file of a kind that opens (see: slamcli formats)"
+    inner = [entry.name for entry in sorted(path.iterdir()) if entry.is_dir() and reader_of(entry) is not None]
+    hint = f"; recordings are in it: {', '.join(inner[:3])}" if inner else ""
+    return f"{path}: not a recording{hint}; see what opens and how it is told: slamcli formats"
 
 
 def _locate(target: str, data: str | None, progress: Progress) -> tuple[Path, str]:
@@ -52,14 +68,12 @@ def _locate(target: str, data: str | None, progress: Progress) -> tuple[Path, st
     if not target.strip():
         raise SlamError("no recording named; give a folder, tum/fr1_room or demo")
     path = Path(target).expanduser()
-    if path.is_dir():
-        return path, _name_of(path)
     if path.exists():
-        raise SlamError(f"{path}: a file; give the folder of a recording (unpack archives first)")
+        return path, _name_of(path)
     roots = _data_roots(data)
     candidates = [root / variant for root in roots for variant in _variants(target)]
     for candidate in candidates:
-        if candidate.is_dir():
+        if candidate.exists():
             return candidate, _name_of(candidate)
     sequence = _tum_sequence(target)
     if sequence is None:
@@ -103,7 +117,7 @@ def _short(sequence: str) -> str:
 
 def _name_of(folder: Path) -> str:
     """Give the name of a recording, fit for a folder below runs/."""
-    name = folder.resolve().name
+    name = folder.resolve().stem if folder.is_file() else folder.resolve().name
     sequence = _tum_sequence(name)
     if sequence:
         return f"tum/{_short(sequence)}"

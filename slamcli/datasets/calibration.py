@@ -1,76 +1,128 @@
-"""Where a recording's intrinsics come from: the user, a camera file in its folder, or the known cameras of the TUM data set."""
+"""Where a recording's intrinsics come from: the user, a file in its folder, a camera's name, or the known cameras of the TUM data set."""
 
-import json
-import re
-import tomllib
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from slamcli.datasets.cameras import FREIBURG, NOMINAL, freiburg_number, nominal
+from slamcli.datasets.intrinsics import read_camera_file, read_intrinsics
 from slamcli.errors import SlamError
-from slamcli.geometry.camera import Camera
+from slamcli.geometry.camera import SHAPE_TOLERANCE, Camera
 
-# J. Sturm et al., A benchmark for the evaluation of RGB-D SLAM systems, IROS 2012, calibration page of the data set. The depth images are
-# already scaled, so the correction factors on that page must not be applied again; ORB-SLAM2 found another 4 % on freiburg2 (5208).
-_VGA = {"width": 640, "height": 480}
-FREIBURG = {
-    1: Camera(**_VGA, fx=517.306408, fy=516.469215, cx=318.643040, cy=255.313989, k1=0.262383, k2=-0.953104, p1=-0.005358, p2=0.002628,
-              k3=1.163314, depth_scale=5000.0),
-    2: Camera(**_VGA, fx=520.908620, fy=521.007327, cx=325.141442, cy=249.701764, k1=0.231222, k2=-0.784899, p1=-0.003257, p2=-0.000105,
-              k3=0.917205, depth_scale=5208.0),
-    3: Camera(**_VGA, fx=535.4, fy=539.2, cx=320.1, cy=247.6, depth_scale=5000.0),
-}  # fmt: skip
 CAMERA_FILES = ("camera.toml", "camera.json")
-MAX_BYTES = 1 << 20
-KEYS = "width height fx fy cx cy k1 k2 p1 p2 k3 depth_scale inverse_depth_offset"
+# Files that hold intrinsics in public layouts and recorders, the most telling first.
+INTRINSICS_FILES = (
+    "camera_intrinsic.json", "cam_params.json", "camera_intrinsics.json", "intrinsics.json", "intrinsic.json", "calibration.json",
+    "calibration.txt", "camera-intrinsics.txt", "camera_intrinsics.txt", "intrinsics.txt", "intrinsic.txt", "K.txt", "calib.txt",
+    "cam_K.txt", "camera_matrix.csv", "camera_info.yaml", "calibration.yaml", "calib.yaml", "camera.yaml", "intrinsics.yaml",
+)  # fmt: skip
+NEEDED = ("fx", "fy", "cx", "cy")
+DEFAULT_DEPTH_SCALE = 1000.0  # millimetres: what nearly all recorders write
+OFF_CENTRE = 0.3  # share of a picture's side within which a principal point lies from the middle, if its size is right
 
 
-def freiburg_number(name: str) -> int | None:
-    """Give n for names such as ``rgbd_dataset_freiburgN_desk``, ``freiburgN_desk`` and ``frN_desk``."""
-    found = re.match(r"(?:rgbd_dataset_)?(?:freiburg|fr)([123])_", name)
-    return int(found.group(1)) if found else None
+@dataclass(frozen=True)
+class Calibration:
+    """What a recording says of its cameras."""
+
+    values: dict[str, Any]  # keys of Camera; of width, height and depth_scale each may lack
+    source: str = ""
+    depth_values: dict[str, Any] | None = None  # intrinsics of a depth camera whose images are not registered to colour
+    T_cd: np.ndarray | None = None  # (4, 4) depth camera to colour camera, None = where colour is
+    warnings: tuple[str, ...] = ()
+
+    def with_defaults(self, **values: Any) -> "Calibration":
+        """Fill in what is not said."""
+        return replace(self, values={**values, **self.values})
+
+
+def find_calibration(root: Path, files: tuple[str, ...] = ()) -> Calibration:
+    """Look for intrinsics in a recording's folder: a camera file of ours, the number in a TUM name, then `files` and the common ones."""
+    for name in CAMERA_FILES:
+        if (root / name).is_file():
+            values, depth, T_cd = read_camera_file(root / name)
+            return Calibration(values, str(root / name), depth, T_cd)
+    number = freiburg_number(root.resolve().name)
+    if number:
+        return Calibration(FREIBURG[number].to_dict(), f"calibration of freiburg{number}")
+    for name in (*files, *INTRINSICS_FILES):
+        if (root / name).is_file():
+            values = read_intrinsics(root / name)
+            if values:
+                return Calibration(values, str(root / name))
+    return Calibration({})
 
 
 def find_camera(folder: Path, override: dict[str, Any] | None, image_size: tuple[int, int] | None) -> Camera:
-    """Give the camera of a recording.
+    """Give the camera of a folder by what is in it; see `complete`."""
+    return complete(find_calibration(folder).with_defaults(), folder, override=override, size=image_size)
 
-    folder : a camera file in it counts more than the freiburg number in its name
+
+def complete(
+    calibration: Calibration,
+    root: Path,
+    *,
+    override: dict[str, Any] | None,
+    size: tuple[int, int] | None,
+    name: str = "",
+    depth_scale: float | None = None,
+) -> Camera:
+    """Make a camera of what a recording says, for pictures of its `size` (width, height), None = unknown.
+
     override : single keys replace what was found; without a calibration it must be complete, save for the image size
-    image_size : (width, height) of the first readable colour image, used where nothing else says it
+    name : of a known camera, whose nominal intrinsics replace those found
+    depth_scale : taken where nothing says it
     """
-    values, source = _recorded(folder)
+    values, source = dict(calibration.values), calibration.source
+    if name:
+        if size is None:
+            raise SlamError(f"{root}: no picture could be read, so the intrinsics of {name} are not known for its size")
+        values = {**{k: v for k, v in values.items() if k == "depth_scale"}, **nominal(name, *size)}
+        source = f"camera {name}"
     if override:
-        values, source = {**values, **override}, "camera override" if not values else f"{source} with camera override"
-    if not values:
+        values, source = {**values, **override}, f"{source} with camera override" if source else "camera override"
+    missing = [key for key in NEEDED if key not in values]
+    if missing and not source:
         raise SlamError(
-            f"{folder}: no calibration; put a camera.toml with the keys {KEYS} into the folder, or set camera.fx=... and the others"
+            f"{root}: no calibration: {', '.join(missing)} are missing; put them into a camera.toml {_place(root)}, set them by "
+            f"-s camera.fx=... and so on, or name the camera: --camera {'|'.join(NOMINAL)}"
         )
-    if image_size is not None:
-        values = {"width": image_size[0], "height": image_size[1], **values}
+    if depth_scale is not None:
+        values.setdefault("depth_scale", depth_scale)
+    if size is not None and "width" not in values and "height" not in values and not missing:
+        values = _sized(values, size, source)
     whole = {key: int(values[key]) for key in ("width", "height") if isinstance(values.get(key), float) and values[key].is_integer()}
-    return Camera.from_dict({**values, **whole}, source=source)
+    camera = Camera.from_dict({**values, **whole}, source=source if str(root) in source else f"{root}: {source}")
+    return camera if size is None else fitted(camera, size, root)
 
 
-def _recorded(folder: Path) -> tuple[dict[str, Any], str]:
-    for name in CAMERA_FILES:
-        path = folder / name
-        if path.is_file():
-            return _read_camera_file(path), str(path)
-    number = freiburg_number(folder.resolve().name)
-    return (FREIBURG[number].to_dict(), f"calibration of freiburg{number}") if number else ({}, "")
+def fitted(camera: Camera, size: tuple[int, int], root: Path) -> Camera:
+    """Bring a calibration to the size of the pictures: scaled where the shape fits, turned where they stand upright."""
+    if (camera.width, camera.height) == size:
+        return camera
+    for candidate in (camera, camera.turned()) if (camera.p1, camera.p2) == (0.0, 0.0) else (camera,):
+        if abs(size[0] / candidate.width / (size[1] / candidate.height) - 1.0) <= SHAPE_TOLERANCE:
+            return candidate.scaled(*size)
+    raise SlamError(
+        f"{root}: colour images are {size[0]} x {size[1]} px but the calibration is for {camera.width} x {camera.height}; "
+        "give the calibration of these images"
+    )
 
 
-def _read_camera_file(path: Path) -> dict[str, Any]:
+def _place(root: Path) -> str:
+    return "in the folder" if root.is_dir() else "beside the file"
+
+
+def _sized(values: dict[str, Any], size: tuple[int, int], source: str) -> dict[str, Any]:
+    """Add the size that intrinsics are for: the pictures' own, or another one of that shape where the principal point is far off."""
     try:
-        if path.stat().st_size > MAX_BYTES:
-            raise SlamError(f"{path}: too large for a camera file")
-        text = path.read_text(encoding="utf-8")
-        values = tomllib.loads(text) if path.suffix == ".toml" else json.loads(text)
-    except OSError as error:
-        raise SlamError(f"{path}: cannot be read ({error.strerror})") from error
-    except (ValueError, RecursionError) as error:  # both parsers' errors and wrong encoding are ValueErrors
-        raise SlamError(f"{path}: cannot be parsed ({error})") from error
-    if isinstance(values, dict) and set(values) == {"camera"}:
-        values = values["camera"]
-    if not isinstance(values, dict) or not values:
-        raise SlamError(f"{path}: must be a table with the keys {KEYS}")
-    return values
+        shares = np.array([float(values["cx"]) / size[0], float(values["cy"]) / size[1]])
+    except (TypeError, ValueError):
+        shares = np.array([0.5, 0.5])  # the camera says what is wrong with them
+    factor = 0.5 / float(shares.mean()) if shares.mean() > 0 else 1.0
+    if (np.abs(shares - 0.5) < OFF_CENTRE / 2).all() or abs(shares[0] / max(shares[1], 1e-9) - 1.0) > 0.15:
+        return {**values, "width": size[0], "height": size[1]}
+    step = 2.0 ** round(float(np.log2(factor))) if abs(np.log2(factor) - round(float(np.log2(factor)))) < 0.1 else factor
+    return {**values, "width": round(size[0] / step), "height": round(size[1] / step)}

@@ -11,7 +11,7 @@ import zlib
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path, PurePosixPath
 
-from slamcli.datasets.calibration import freiburg_number
+from slamcli.datasets.cameras import freiburg_number
 from slamcli.datasets.staging import staged
 from slamcli.errors import SlamError
 

@@ -1,4 +1,4 @@
-"""Decode colour and depth images; whatever is wrong with a file becomes a BadFrame that names it.
+"""Decode colour and depth images; whatever is wrong with one becomes a BadFrame that names it.
 
 Colour is decoded without honouring EXIF orientation: turning the picture would break its calibration. Grey is the luma of ITU-R BT.601 in
 integer arithmetic, hence the same on every machine: a JPEG stores it, a PNG's is computed by the fixed-point formula of
@@ -6,6 +6,7 @@ integer arithmetic, hence the same on every machine: a JPEG stores it, a PNG's i
 """
 
 import struct
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -14,10 +15,55 @@ import numpy as np
 from slamcli.errors import BadFrame
 
 MAX_BYTES = 256 << 20  # of one image file
+MAX_PIXELS = 100_000_000  # of one image
 PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 JPEG_MAGIC = b"\xff\xd8\xff"
+EXR_MAGIC = b"\x76\x2f\x31\x01"
+NPY_MAGIC = b"\x93NUMPY"
 JPEG_SIZE_MARKERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # SOF0..15 without DHT, JPG, DAC
 JPEG_BARE_MARKERS = frozenset({0x01, *range(0xD0, 0xD9)})  # carry no length
+REDUCED = {2: cv2.IMREAD_REDUCED_GRAYSCALE_2, 4: cv2.IMREAD_REDUCED_GRAYSCALE_4, 8: cv2.IMREAD_REDUCED_GRAYSCALE_8}
+REDUCED_COLOUR = {2: cv2.IMREAD_REDUCED_COLOR_2, 4: cv2.IMREAD_REDUCED_COLOR_4, 8: cv2.IMREAD_REDUCED_COLOR_8}
+
+# How pixels that come without a file format become (grey, RGB): OpenCV's conversion, None = none needed, "" = drop nothing.
+# The names are those of ROS (sensor_msgs/image_encodings) and FFmpeg. A Bayer pattern is named by OpenCV one pixel farther along.
+TO_GREY_AND_RGB: dict[str, tuple[int | None, int | None]] = {
+    "rgb8": (cv2.COLOR_RGB2GRAY, None),
+    "bgr8": (cv2.COLOR_BGR2GRAY, cv2.COLOR_BGR2RGB),
+    "rgba8": (cv2.COLOR_RGBA2GRAY, cv2.COLOR_RGBA2RGB),
+    "bgra8": (cv2.COLOR_BGRA2GRAY, cv2.COLOR_BGRA2RGB),
+    "mono8": (None, cv2.COLOR_GRAY2RGB),
+    "bayer_rggb8": (cv2.COLOR_BayerBG2GRAY, cv2.COLOR_BayerBG2RGB),
+    "bayer_bggr8": (cv2.COLOR_BayerRG2GRAY, cv2.COLOR_BayerRG2RGB),
+    "bayer_gbrg8": (cv2.COLOR_BayerGR2GRAY, cv2.COLOR_BayerGR2RGB),
+    "bayer_grbg8": (cv2.COLOR_BayerGB2GRAY, cv2.COLOR_BayerGB2RGB),
+    "yuv422": (cv2.COLOR_YUV2GRAY_UYVY, cv2.COLOR_YUV2RGB_UYVY),
+    "uyvy": (cv2.COLOR_YUV2GRAY_UYVY, cv2.COLOR_YUV2RGB_UYVY),
+    "yuv422_yuy2": (cv2.COLOR_YUV2GRAY_YUY2, cv2.COLOR_YUV2RGB_YUY2),
+    "yuyv": (cv2.COLOR_YUV2GRAY_YUY2, cv2.COLOR_YUV2RGB_YUY2),
+    "yuv420p": (cv2.COLOR_YUV2GRAY_I420, cv2.COLOR_YUV2RGB_I420),
+    "nv12": (cv2.COLOR_YUV2GRAY_NV12, cv2.COLOR_YUV2RGB_NV12),
+}
+PLANAR = ("yuv420p", "nv12")  # rows of luma, then half as many of chroma
+LIMITED = ("yuv420p", "nv12", "yuv422", "uyvy", "yuv422_yuy2", "yuyv")  # luma from 16, black, to 235, white: ITU-R BT.601
+FULL_RANGE = np.clip(np.rint((np.arange(256) - 16.0) * (255.0 / 219.0)), 0, 255).astype(np.uint8)
+
+
+@dataclass(frozen=True)
+class Pixels:
+    """Pixels that come without a file format, as messages and videos carry them."""
+
+    data: np.ndarray  # (H, W, C) or (H, W) uint8; PLANAR: (3 H / 2, W)
+    encoding: str  # a row of TO_GREY_AND_RGB
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Give (width, height) [px]."""
+        height, width = self.data.shape[:2]
+        return (width, height * 2 // 3) if self.encoding in PLANAR else (width, height)
+
+
+Picture = bytes | Pixels
 
 
 def read_bytes(path: Path) -> bytes:
@@ -29,14 +75,19 @@ def read_bytes(path: Path) -> bytes:
         data = path.read_bytes()
     except OSError as error:
         raise BadFrame(f"{path}: cannot be read ({error.strerror})") from error
+    check_whole(data, str(path))
+    return data
+
+
+def check_whole(data: bytes, name: str) -> None:
+    """Raise BadFrame for an encoded image that is empty or cut off."""
     if not data:
-        raise BadFrame(f"{path}: is empty (0 bytes)")
+        raise BadFrame(f"{name}: is empty (0 bytes)")
     if data.startswith(PNG_MAGIC) and b"IEND" not in data[-64:]:
-        raise BadFrame(f"{path}: PNG is cut off")
+        raise BadFrame(f"{name}: PNG is cut off")
     # Decoders fill the missing part of a JPEG with grey and go on; trailing bytes after the end marker are common and harmless.
     if data.startswith(JPEG_MAGIC) and b"\xff\xd9" not in data[-4096:]:
-        raise BadFrame(f"{path}: JPEG is cut off")
-    return data
+        raise BadFrame(f"{name}: JPEG is cut off")
 
 
 def image_size(data: bytes) -> tuple[int, int] | None:
@@ -60,52 +111,136 @@ def image_size(data: bytes) -> tuple[int, int] | None:
     return None
 
 
-def decode_grey(path: Path, size: tuple[int, int]) -> np.ndarray:
-    """Give the grey image, (height, width) uint8; `size` is the (width, height) it must have."""
-    data = _checked(path, size)
-    if data.startswith(JPEG_MAGIC):
-        return _decode(path, data, cv2.IMREAD_GRAYSCALE, size)
-    return cv2.cvtColor(_decode(path, data, cv2.IMREAD_COLOR, size), cv2.COLOR_BGR2GRAY)
+def picture_size(picture: Picture, name: str) -> tuple[int, int]:
+    """Give (width, height) of a picture, from its header where that says it; BadFrame where it is no picture."""
+    if isinstance(picture, Pixels):
+        return picture.size
+    found = image_size(picture)
+    if found is None:
+        height, width = _decode(picture, cv2.IMREAD_UNCHANGED, name).shape[:2]
+        found = width, height
+    return found
 
 
-def decode_rgb(path: Path, size: tuple[int, int]) -> np.ndarray:
-    """Give the colour image, (height, width, 3) uint8, red first."""
-    return cv2.cvtColor(_decode(path, _checked(path, size), cv2.IMREAD_COLOR, size), cv2.COLOR_BGR2RGB)
+def decode_grey(picture: Picture, size: tuple[int, int], *, name: str, reduction: int = 1) -> np.ndarray:
+    """Give the grey image, (height // reduction, width // reduction) uint8; `size` is the (width, height) it must have before."""
+    if isinstance(picture, Pixels):
+        return _reduced(_converted(picture, 0, size, name), size, reduction)
+    _check_size(picture, size, name)
+    if picture.startswith(JPEG_MAGIC):
+        flags = REDUCED.get(_power(reduction), cv2.IMREAD_GRAYSCALE)
+        return _reduced(_decode(picture, flags, name, None if flags in REDUCED.values() else size), size, reduction)
+    return _reduced(cv2.cvtColor(_decode(picture, cv2.IMREAD_COLOR, name, size), cv2.COLOR_BGR2GRAY), size, reduction)
 
 
-def decode_depth(path: Path, size: tuple[int, int]) -> np.ndarray:
-    """Give the raw depth image, (height, width) uint16; BadFrame for any other pixel type, 8 bits above all."""
-    raw = _decode(path, _checked(path, size), cv2.IMREAD_UNCHANGED, size)
+def decode_rgb(picture: Picture, size: tuple[int, int], *, name: str, reduction: int = 1) -> np.ndarray:
+    """Give the colour image, (height // reduction, width // reduction, 3) uint8, red first."""
+    if isinstance(picture, Pixels):
+        return _reduced(_converted(picture, 1, size, name), size, reduction)
+    _check_size(picture, size, name)
+    flags = REDUCED_COLOUR.get(_power(reduction), cv2.IMREAD_COLOR) if picture.startswith(JPEG_MAGIC) else cv2.IMREAD_COLOR
+    image = _decode(picture, flags, name, size if flags == cv2.IMREAD_COLOR else None)
+    return cv2.cvtColor(_reduced(image, size, reduction), cv2.COLOR_BGR2RGB)
+
+
+def decode_depth(data: bytes, size: tuple[int, int] | None = None, *, name: str) -> np.ndarray:
+    """Give the raw depth image, (height, width) uint16 or float32; BadFrame for any other pixel type, 8 bits above all.
+
+    PNG, TIFF and PNM of 16 bits or of floats, EXR, and numpy's .npy without objects.
+    """
+    _check_size(data, size, name)
+    if data.startswith(EXR_MAGIC):
+        from slamcli.datasets import exr
+
+        raw = exr.decode(data, name=name)
+    elif data.startswith(NPY_MAGIC):
+        raw = decode_npy(data, name)
+    else:
+        raw = _decode(data, cv2.IMREAD_UNCHANGED, name)
+    return checked_depth(raw, size, name=name)
+
+
+def checked_depth(raw: np.ndarray, size: tuple[int, int] | None = None, *, name: str) -> np.ndarray:
+    """Give depth pixels as (height, width) uint16 or float32; BadFrame where they are of another kind."""
+    if raw.ndim == 3 and raw.shape[2] == 1:
+        raw = raw[..., 0]
     if raw.ndim != 2:
-        raise BadFrame(f"{path}: has {raw.shape[2]} channels; depth must be a one-channel image of 16 bits")
-    if raw.dtype != np.uint16:
-        raise BadFrame(f"{path}: has {raw.itemsize * 8} bits a pixel; depth must have 16 (was it saved as a picture for viewing?)")
+        channels = raw.shape[2] if raw.ndim == 3 else raw.ndim
+        raise BadFrame(f"{name}: has {channels} channels; depth must be a one-channel image of 16 bits")
+    if raw.dtype == np.uint8:
+        raise BadFrame(f"{name}: has 8 bits a pixel; depth must have 16 (was it saved as a picture for viewing?)")
+    if raw.dtype.kind == "f" and raw.itemsize in (2, 4, 8):
+        raw = np.ascontiguousarray(raw, dtype=np.float32)
+    elif raw.dtype.kind in "ui" and raw.itemsize > 2:
+        raw = np.where((raw > 0) & (raw < 65535), raw, 0).astype(np.uint16)
+    elif raw.dtype.kind == "i":
+        raw = np.maximum(raw, 0).astype(np.uint16)
+    elif raw.dtype != np.uint16:
+        raise BadFrame(f"{name}: has pixels of type {raw.dtype}; depth must be 16-bit whole numbers or floating-point metres")
+    if size is not None and raw.shape[::-1] != size:
+        raise _size_error(name, (raw.shape[1], raw.shape[0]), size)
     return raw
 
 
-def _checked(path: Path, size: tuple[int, int]) -> bytes:
-    """Read the file and compare the header's size before any memory is reserved for pixels."""
-    data = read_bytes(path)
+def decode_npy(data: bytes, name: str) -> np.ndarray:
+    """Read an array of numbers in numpy's own format; nothing is unpickled, and the header's size is believed only up to the file's."""
+    import io
+
+    try:
+        stream = io.BytesIO(data)
+        version = np.lib.format.read_magic(stream)
+        read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        shape, _, dtype = read_header(stream)
+        if dtype.hasobject or dtype.kind not in "uif" or int(np.prod(shape, dtype=np.float64)) * dtype.itemsize > len(data):
+            raise BadFrame(f"{name}: is no array of numbers, or is cut off")
+        return np.load(io.BytesIO(data), allow_pickle=False)
+    except (ValueError, EOFError) as error:
+        raise BadFrame(f"{name}: is damaged ({error})") from error
+
+
+def _converted(picture: Pixels, which: int, size: tuple[int, int], name: str) -> np.ndarray:
+    if picture.encoding not in TO_GREY_AND_RGB:
+        raise BadFrame(f"{name}: pixels of kind {picture.encoding!r} are not known; known are {', '.join(TO_GREY_AND_RGB)}")
+    if picture.size != size:
+        raise _size_error(name, picture.size, size)
+    code = TO_GREY_AND_RGB[picture.encoding][which]
+    image = picture.data if code is None else cv2.cvtColor(picture.data, code)
+    return cv2.LUT(image, FULL_RANGE) if which == 0 and picture.encoding in LIMITED else image
+
+
+def _power(reduction: int) -> int:
+    """Give the largest reduction that JPEG's decoder offers up to this one."""
+    return max((power for power in REDUCED if power <= reduction), default=1)
+
+
+def _reduced(image: np.ndarray, size: tuple[int, int], reduction: int) -> np.ndarray:
+    """Average an image, which may have been reduced in part already, to its final size."""
+    wanted = (size[0] // reduction, size[1] // reduction)
+    return image if image.shape[1::-1] == wanted else cv2.resize(image, wanted, interpolation=cv2.INTER_AREA)
+
+
+def _check_size(data: bytes, size: tuple[int, int] | None, name: str) -> None:
+    """Compare the header's size before any memory is reserved for pixels."""
     found = image_size(data)
-    if found is not None and found != size:
-        raise _size_error(path, found, size)
-    return data
+    if found is None:
+        return
+    if size is not None and found != size:
+        raise _size_error(name, found, size)
+    if found[0] * found[1] > MAX_PIXELS:
+        raise BadFrame(f"{name}: {found[0]} x {found[1]} px is too large for an image")
 
 
-def _decode(path: Path, data: bytes, flags: int, size: tuple[int, int]) -> np.ndarray:
+def _decode(data: bytes, flags: int, name: str, size: tuple[int, int] | None = None) -> np.ndarray:
     try:
         image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION)
     except cv2.error as error:
-        raise BadFrame(f"{path}: cannot be decoded ({error.err})") from error
+        raise BadFrame(f"{name}: cannot be decoded ({error.err})") from error
     if image is None:
-        raise BadFrame(f"{path}: is damaged, or not an image")
-    if image.shape[1::-1] != size:
-        raise _size_error(path, image.shape[1::-1], size)
+        raise BadFrame(f"{name}: is damaged, or not an image")
+    if size is not None and image.shape[1::-1] != size:
+        raise _size_error(name, image.shape[1::-1], size)
     return image
 
 
-def _size_error(path: Path, found: tuple[int, int], size: tuple[int, int]) -> BadFrame:
-    return BadFrame(
-        f"{path}: is {found[0]} x {found[1]} px, the camera's images are {size[0]} x {size[1]}; "
-        "colour and depth must have that one size (depth registered to colour)"
-    )
+def _size_error(name: str, found: tuple[int, ...], size: tuple[int, int]) -> BadFrame:
+    return BadFrame(f"{name}: is {found[0]} x {found[1]} px, the others are {size[0]} x {size[1]}; all images of a recording have one size")

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from slamcli.datasets.tum import associate
+from slamcli.datasets.association import associate
 from slamcli.dense import occupancy
 from slamcli.errors import BadFrame
 from slamcli.evaluation import grid_truth, trajectory_error

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from slamcli.datasets.tum import MAX_DIFFERENCE, associate
+from slamcli.datasets.association import MAX_DIFFERENCE, associate
 from slamcli.errors import SlamError
 from slamcli.geometry import se3
 from slamcli.schema import Features, Map, Tracks, Trajectory, trajectory

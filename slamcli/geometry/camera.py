@@ -1,9 +1,9 @@
-"""The pinhole camera with Brown-Conrady distortion.
+"""The pinhole camera and its lens: Brown-Conrady, rational or equidistant distortion.
 
 Pixel (0, 0) is the centre of the top-left pixel. Camera axes: x right, y down, z forward.
 """
 
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from functools import cached_property
 
 import numpy as np
@@ -11,7 +11,11 @@ import numpy as np
 from slamcli.errors import SlamError
 
 DEPTH_VALUES = 1 << 16  # of a 16-bit depth image
+NO_READING = (0, DEPTH_VALUES - 1)  # 16-bit readings that mean none: 0 everywhere, the largest value of cameras that saturate
 MAX_INVERSE_DEPTH_OFFSET = 0.1  # [1/m]; a Kinect's is some thousandths
+POLYNOMIAL, EQUIDISTANT = "polynomial", "equidistant"  # values of Camera.lens
+LATER_FIELDS = {"k4": 0.0, "k5": 0.0, "k6": 0.0, "lens": POLYNOMIAL}  # written only where they say something
+SHAPE_TOLERANCE = 0.01  # by which width and height may be scaled differently: sizes are rounded
 
 
 @dataclass(frozen=True)
@@ -31,9 +35,15 @@ class Camera:
     k3: float = 0.0
     depth_scale: float = 5000.0  # units of the depth image per metre
     inverse_depth_offset: float = 0.0  # 1/m, added to the inverse of each reading: a sensor that triangulates errs by a constant disparity
+    k4: float = 0.0  # k4 k5 k6: denominator of the rational model, OpenCV's CALIB_RATIONAL_MODEL; equidistant: k1 k2 k3 k4 of its fisheye
+    k5: float = 0.0
+    k6: float = 0.0
+    lens: str = POLYNOMIAL  # or EQUIDISTANT
 
     def __post_init__(self) -> None:
-        for name in (f.name for f in fields(self)):
+        if self.lens not in (POLYNOMIAL, EQUIDISTANT):
+            raise SlamError(f"camera.lens = {self.lens!r}: must be {POLYNOMIAL} or {EQUIDISTANT}")
+        for name in (f.name for f in fields(self) if f.name != "lens"):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(value):
                 raise SlamError(f"camera.{name} = {value!r}: must be a finite number")
@@ -61,8 +71,34 @@ class Camera:
 
     @property
     def is_distorted(self) -> bool:
-        """Say whether any distortion coefficient differs from 0."""
-        return any((self.k1, self.k2, self.p1, self.p2, self.k3))
+        """Say whether the lens bends rays."""
+        return self.lens != POLYNOMIAL or self.is_rational or any((self.k1, self.k2, self.p1, self.p2, self.k3))
+
+    @property
+    def is_rational(self) -> bool:
+        """Say whether the polynomial of the lens has a denominator."""
+        return self.lens == POLYNOMIAL and any((self.k4, self.k5, self.k6))
+
+    @property
+    def coefficients(self) -> np.ndarray:
+        """Give k1 k2 p1 p2 k3 k4 k5 k6, (8,), the order of OpenCV and ROS."""
+        return np.array([self.k1, self.k2, self.p1, self.p2, self.k3, self.k4, self.k5, self.k6], dtype=np.float64)
+
+    def scaled(self, width: int, height: int) -> "Camera":
+        """Give the camera of the same pictures in another size; SlamError where the shape is another."""
+        across, down = width / self.width, height / self.height
+        if abs(across / down - 1.0) > SHAPE_TOLERANCE:
+            raise SlamError(f"a calibration for {self.width} x {self.height} px does not fit images of {width} x {height}: another shape")
+        return replace(
+            self, width=width, height=height, fx=self.fx * across, fy=self.fy * down,
+            cx=(self.cx + 0.5) * across - 0.5, cy=(self.cy + 0.5) * down - 0.5,
+        )  # fmt: skip
+
+    def turned(self) -> "Camera":
+        """Give the camera of the same pictures turned clockwise by 90 degrees."""
+        if self.is_distorted and (self.p1, self.p2) != (0.0, 0.0):
+            raise SlamError("a calibration with tangential distortion cannot be turned with its pictures; give that of these images")
+        return replace(self, width=self.height, height=self.width, fx=self.fy, fy=self.fx, cx=self.height - 1.0 - self.cy, cy=self.cx)
 
     @cached_property
     def rays(self) -> np.ndarray:
@@ -74,7 +110,16 @@ class Camera:
     def metres(self) -> np.ndarray:
         """Give the depth (65536,) float32 [m] of every possible reading, NaN where there is none: one look-up converts and masks."""
         read = np.arange(DEPTH_VALUES, dtype=np.float32) / np.float32(self.depth_scale)
-        read[0] = np.nan
+        read[list(NO_READING)] = np.nan
+        return self._from_read(read)
+
+    def to_metres(self, raw: np.ndarray) -> np.ndarray:
+        """Convert readings (...), uint16 or floating, to depth (...) float32 [m], NaN where there is none."""
+        if raw.dtype == np.uint16:
+            return self.metres[raw]
+        read = raw.astype(np.float32) / np.float32(self.depth_scale)
+        with np.errstate(invalid="ignore"):
+            read[~((read > 0.0) & (read < np.inf))] = np.nan
         return self._from_read(read)
 
     def reread(self, depth: np.ndarray, given: "Camera") -> np.ndarray:
@@ -123,14 +168,23 @@ class Camera:
             return raw
         from slamcli.geometry import lens  # numba takes a third of a second to load
 
-        normal = np.empty_like(raw)
-        lens.undistort(np.ascontiguousarray(raw).reshape(-1, 2), self.k1, self.k2, self.k3, self.p1, self.p2, normal.reshape(-1, 2))
+        normal, flat = np.empty_like(raw), np.ascontiguousarray(raw).reshape(-1, 2)
+        if self.lens == EQUIDISTANT:
+            lens.undistort_equidistant(flat, self.coefficients[[0, 1, 4, 5]], normal.reshape(-1, 2))
+        elif self.is_rational:
+            lens.undistort_rational(flat, self.coefficients, normal.reshape(-1, 2))
+        else:
+            lens.undistort(flat, self.k1, self.k2, self.k3, self.p1, self.p2, normal.reshape(-1, 2))
         return normal
 
     def _distort_normal(self, normal: np.ndarray) -> np.ndarray:
         x, y = normal[..., 0], normal[..., 1]
         r2 = x * x + y * y
+        if self.lens == EQUIDISTANT:
+            return normal * self._equidistant_factor(np.sqrt(r2))[..., None]
         radial = 1.0 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
+        if self.is_rational:
+            radial = radial / (1.0 + r2 * (self.k4 + r2 * (self.k5 + r2 * self.k6)))
         return np.stack(
             [
                 x * radial + 2.0 * self.p1 * x * y + self.p2 * (r2 + 2.0 * x * x),
@@ -139,9 +193,15 @@ class Camera:
             axis=-1,
         )
 
+    def _equidistant_factor(self, r: np.ndarray) -> np.ndarray:
+        """Give by what the distance r from the axis on the plane z = 1 is multiplied: theta (1 + k1 theta^2 + ..) / r."""
+        theta2 = np.arctan(r) ** 2
+        theta_d = np.arctan(r) * (1.0 + theta2 * (self.k1 + theta2 * (self.k2 + theta2 * (self.k3 + theta2 * self.k4))))
+        return np.where(r > 1e-9, theta_d / np.maximum(r, 1e-9), 1.0)
+
     def to_dict(self) -> dict:
-        """Give the keys of `camera.json`."""
-        return asdict(self)
+        """Give the keys of `camera.json`; what only other lenses have is left out."""
+        return {name: value for name, value in asdict(self).items() if name not in LATER_FIELDS or value != LATER_FIELDS[name]}
 
     @classmethod
     def from_dict(cls, values: dict, *, source: str) -> "Camera":

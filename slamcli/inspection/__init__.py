@@ -9,10 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from slamcli.datasets import Dataset, open_dataset, silent
+from slamcli.config.options import RecordingConfig
+from slamcli.datasets import Dataset, depth_unit, open_dataset, silent
+from slamcli.datasets.depth_unit import DepthUnit
 from slamcli.errors import SlamError
-from slamcli.inspection import depth_unit, pictures, registration, timing
-from slamcli.inspection.depth_unit import DepthUnit
+from slamcli.inspection import pictures, registration, timing
 from slamcli.inspection.pictures import Pictures
 from slamcli.inspection.registration import Registration
 from slamcli.inspection.timing import Timing
@@ -80,16 +81,22 @@ class Inspection:
 
 
 def inspect(
-    target: str, *, data: str | None = None, camera: dict[str, Any] | None = None, workers: int = 2, progress: Progress = silent
+    target: str,
+    *,
+    data: str | None = None,
+    camera: dict[str, Any] | None = None,
+    options: RecordingConfig | None = None,
+    workers: int = 2,
+    progress: Progress = silent,
 ) -> Inspection:
     """Inspect a recording: every image is read once."""
     try:
-        dataset = open_dataset(target, data=data, camera=camera, progress=progress)
+        dataset = open_dataset(target, data=data, camera=camera, options=options, progress=progress)
     except SlamError as error:
         return Inspection(target, [Finding(ERROR, "opening", str(error))])
     times = timing.judge(dataset)
     seen = pictures.look(dataset, workers=workers, progress=progress)
-    unit = depth_unit.judge(seen.depth_counts, dataset.camera.depth_scale)
+    unit = depth_unit.judge(seen.depth_counts, pictures.counting_scale(dataset.camera))
     fit = registration.measure(dataset, workers=workers)
     findings = [
         *_about_lists(dataset, times),
@@ -141,15 +148,15 @@ def _about_order(dataset: Dataset, times: Timing, seen: Pictures) -> list[Findin
             Finding(
                 WARNING,
                 "order",
-                f"{len(times.misnamed)} frames have other stamps than their files' names say, the first is {dataset.colour_path[first]}",
+                f"{len(times.misnamed)} frames have other stamps than their files' names say, the first is {dataset.colour_name[first]}",
                 "the stamps in the list are swapped or edited; restore the list",
             )
         )
-    has_depth = np.array([bool(path) for path in dataset.depth_path])
+    has_depth = np.array([bool(path) for path in dataset.depth_name])
     rows = np.flatnonzero(has_depth)
     for what, paths, found in (
-        ("colour", dataset.colour_path, pictures.misplaced(seen.thumbnail, dataset.stamp)),
-        ("depth", dataset.depth_path, rows[pictures.misplaced(seen.depth_thumbnail[rows], dataset.depth_stamp[rows])]),
+        ("colour", dataset.colour_name, pictures.misplaced(seen.thumbnail, dataset.stamp)),
+        ("depth", dataset.depth_name, rows[pictures.misplaced(seen.depth_thumbnail[rows], dataset.depth_stamp[rows])]),
     ):
         if len(found):
             findings.append(
@@ -166,7 +173,7 @@ def _about_order(dataset: Dataset, times: Timing, seen: Pictures) -> list[Findin
 def _about_files(dataset: Dataset, seen: Pictures) -> list[Finding]:
     if not seen.errors:
         return []
-    n_images = len(dataset) + sum(map(bool, dataset.depth_path))
+    n_images = len(dataset) + sum(map(bool, dataset.depth_name))
     level = ERROR if len(seen.errors) > MANY_FRAMES * n_images else WARNING
     more = f" and {len(seen.errors) - 1} more" if len(seen.errors) > 1 else ""
     return [Finding(level, "files", f"{seen.errors[0]}{more}", "such frames are skipped; copy or unpack the recording again")]
@@ -255,7 +262,8 @@ def _facts(dataset: Dataset, times: Timing, seen: Pictures, unit: DepthUnit, fit
         "offset_histogram": [[round(a, 4), round(b, 4), n] for a, b, n in times.offset_histogram],
         "depth_scale": camera.depth_scale,
         "depth_m": {key: round(value, 3) for key, value in unit.percentiles.items()},
-        "depth_step_at_1m": _finite(unit.step_at_1m, 5),
+        "depth_q": _finite(unit.q, 1),
+        "depth_steps_of": unit.camera or None,
         "likely_depth_scale": unit.likely_scale,
         "holes": _median(seen.holes),
         "never_seen": round(seen.never_seen, 4),

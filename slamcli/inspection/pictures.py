@@ -9,7 +9,7 @@ import numpy as np
 
 from slamcli.datasets import Dataset
 from slamcli.errors import BadFrame
-from slamcli.geometry.camera import DEPTH_VALUES
+from slamcli.geometry.camera import DEPTH_VALUES, Camera
 from slamcli.parallel import ordered_map
 
 THUMBNAIL = (32, 24)  # px, width and height of the small pictures that are compared with one another
@@ -18,6 +18,8 @@ FAST_THRESHOLD = 20  # grey levels
 BLUR_SPAN = 9 / 640  # of the picture's width; of the filter that blur is judged with
 LINE_STEP = 4  # every fourth row and column is enough to judge a whole picture
 DEPTH_STEP = 4  # likewise for depth readings
+FINEST_WHOLE_UNIT = 50.0  # depth units per metre from which readings are whole numbers
+MILLIMETRES = 1000.0
 STRANGER = 1.7  # times the difference between its neighbours: in an even motion the ratio is 0.5
 SWAPPED = 0.75  # of the difference as listed: in an even motion the ratio is 2, after a swap 0.5
 JUMP = 5.0  # times the largest difference nearby
@@ -58,6 +60,11 @@ def look(dataset: Dataset, *, workers: int, progress: Progress) -> Pictures:
     return Pictures(**columns, never_seen=float(1.0 - has_seen.mean()), depth_counts=counts, errors=errors)
 
 
+def counting_scale(camera: Camera) -> float:
+    """Give the units per metre in which readings are counted: the recording's own, millimetres for floating-point metres."""
+    return camera.depth_scale if camera.depth_scale >= FINEST_WHOLE_UNIT else MILLIMETRES
+
+
 def _frame(dataset: Dataset, i: int) -> tuple[dict[str, Any], np.ndarray | None, np.ndarray | None, list[str]]:
     errors = []
     row: dict[str, Any] = dict.fromkeys(("mean_grey", "saturated", "blur", "corners", "holes"), np.nan)
@@ -77,7 +84,7 @@ def _frame(dataset: Dataset, i: int) -> tuple[dict[str, Any], np.ndarray | None,
     row["holes"] = float(1.0 - seen.mean())
     row["depth_thumbnail"] = _inverse_depth_thumbnail(depth, seen)
     some = depth[::DEPTH_STEP, ::DEPTH_STEP][seen[::DEPTH_STEP, ::DEPTH_STEP]]
-    raw = np.rint(some * dataset.camera.depth_scale).astype(np.int64)
+    raw = np.rint(some * counting_scale(dataset.camera)).astype(np.int64)
     return row, seen, np.bincount(raw.clip(0, DEPTH_VALUES - 1), minlength=DEPTH_VALUES), errors
 
 

@@ -90,7 +90,7 @@ def _collect(dataset: Dataset, workers: int) -> tuple[_Colours, list[_Edges]]:
     """Read stretches of consecutive frames spread over the recording."""
     n = len(dataset)
     starts = np.unique(np.linspace(0, max(n - BLOCK_FRAMES, 0), BLOCKS).astype(int))
-    wanted_depth = sorted({i for start in starts for i in range(start, min(start + BLOCK_FRAMES, n)) if dataset.depth_path[i]})
+    wanted_depth = sorted({i for start in starts for i in range(start, min(start + BLOCK_FRAMES, n)) if dataset.depth_name[i]})
     wanted_colour = sorted({i for j in wanted_depth for i in range(max(j - AROUND, 0), min(j + AROUND + 1, n))})
     read = zip(wanted_colour, ordered_map(partial(_try, dataset.grey), wanted_colour, workers=workers), strict=True)
     greys = {i: grey for i, grey in read if grey is not None}

@@ -1,12 +1,13 @@
 """The time stamps of a recording: rates, gaps, how colour and depth meet, and whether the file names agree."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import PurePosixPath
 
 import numpy as np
 
 from slamcli.datasets import Dataset
-from slamcli.datasets.tum import MAX_DIFFERENCE
+from slamcli.datasets.association import MAX_DIFFERENCE
 
 NAME_TOLERANCE = 2e-3  # [s] between a stamp and the one in the file's name: names round
 GAP_PERIODS = 8.0  # a pause this many times as long as usual is a gap,
@@ -37,8 +38,8 @@ def judge(dataset: Dataset) -> Timing:
     offset = (depth_stamp - stamp)[has_depth]
     histogram, _ = np.histogram(offset, OFFSET_EDGES)
     period = float(np.median(np.diff(stamp))) if len(stamp) > 1 else 0.0
-    colour_misnamed, _ = _compare_names(stamp, dataset.colour_path)
-    depth_misnamed, depth_offset = _compare_names(depth_stamp, dataset.depth_path)
+    colour_misnamed, _ = _compare_names(stamp, dataset.colour_name)
+    depth_misnamed, depth_offset = _compare_names(depth_stamp, dataset.depth_name)
     return Timing(
         duration=float(stamp[-1] - stamp[0]),
         rate=1.0 / period if period > 0 else 0.0,
@@ -61,7 +62,7 @@ def _gaps(stamp: np.ndarray, start: float) -> list[tuple[float, float]]:
     return [(float(stamp[k] - start), float(pause[k])) for k in np.flatnonzero(is_gap)]
 
 
-def _compare_names(stamp: np.ndarray, paths: list[str]) -> tuple[list[int], float | None]:
+def _compare_names(stamp: np.ndarray, paths: Sequence[str]) -> tuple[list[int], float | None]:
     """Compare stamps with file names that are stamps themselves: (frames that stand out, offset all others share)."""
     rows, difference = [], []
     for i, path in enumerate(paths):

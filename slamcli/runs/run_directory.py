@@ -126,7 +126,8 @@ class RunDir:
         root = self.info()["root"]
         if not Path(root).exists():
             raise SlamError(f"{root}: the recording is not there any more; put it back, or: slamcli run TARGET -r {self.path}")
-        return open_dataset(root, camera=dict((config or self.config()).camera) or None)
+        config = config or self.config()
+        return open_dataset(root, camera=dict(config.camera) or None, options=config.recording)
 
     def camera(self, stage: str = "extract") -> "Camera":
         """Read the intrinsics that extract used, or those known after optimize or loop."""

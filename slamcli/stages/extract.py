@@ -146,6 +146,6 @@ def _flow_table(dataset: Dataset, camera: Camera, found: list[_Frame], tools: To
 def _write_association(path: Path, dataset: Dataset, depth_stamp: np.ndarray) -> None:
     """Write which depth image goes with which colour image, in the format of the TUM tools: stamp, path, stamp, path."""
     lines = ["# colour stamp [s], colour image, depth stamp [s], depth image; commented out: no usable depth image"]
-    for stamp, colour, with_depth, depth in zip(dataset.stamp, dataset.colour_path, depth_stamp, dataset.depth_path, strict=True):
+    for stamp, colour, with_depth, depth in zip(dataset.stamp, dataset.colour_name, depth_stamp, dataset.depth_name, strict=True):
         lines.append(f"{stamp:.6f} {colour} {with_depth:.6f} {depth}" if np.isfinite(with_depth) else f"# {stamp:.6f} {colour}")
     path.write_text("\n".join(lines) + "\n")

@@ -6,7 +6,8 @@ from pathlib import Path
 import pytest
 from recordings import CAMERA
 
-from slamcli.datasets.calibration import FREIBURG, find_camera, freiburg_number
+from slamcli.datasets.calibration import find_camera
+from slamcli.datasets.cameras import FREIBURG, freiburg_number
 from slamcli.errors import SlamError
 
 OWN = json.loads(CAMERA)

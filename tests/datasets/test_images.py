@@ -11,6 +11,18 @@ from slamcli.datasets import images
 from slamcli.errors import BadFrame
 
 
+def grey(path: Path) -> np.ndarray:
+    return images.decode_grey(images.read_bytes(path), SIZE, name=str(path))
+
+
+def rgb(path: Path) -> np.ndarray:
+    return images.decode_rgb(images.read_bytes(path), SIZE, name=str(path))
+
+
+def raw_depth(path: Path) -> np.ndarray:
+    return images.decode_depth(images.read_bytes(path), SIZE, name=str(path))
+
+
 def written(folder: Path, data: bytes, name: str = "image.png") -> Path:
     path = folder / name
     path.write_bytes(data)
@@ -21,33 +33,33 @@ def test_grey_of_png_is_the_integer_luma_formula(tmp_path: Path) -> None:
     bgr = colour()
     b, g, r = (bgr[..., k].astype(np.int64) for k in range(3))
     expected = (9798 * r + 19235 * g + 3735 * b + (1 << 14)) >> 15
-    assert np.array_equal(images.decode_grey(written(tmp_path, png(bgr)), SIZE), expected)
+    assert np.array_equal(grey(written(tmp_path, png(bgr))), expected)
 
 
 def test_grey_of_jpeg_is_its_stored_luma(tmp_path: Path) -> None:
     smooth = cv2.GaussianBlur(colour(), (0, 0), 4)
     path = written(tmp_path, png(smooth, ".jpg"), "image.jpg")
-    assert np.abs(images.decode_grey(path, SIZE).astype(int) - cv2.cvtColor(smooth, cv2.COLOR_BGR2GRAY)).mean() < 2.0
+    assert np.abs(grey(path).astype(int) - cv2.cvtColor(smooth, cv2.COLOR_BGR2GRAY)).mean() < 2.0
 
 
 def test_gamma_chunk_of_a_png_changes_nothing(tmp_path: Path) -> None:
     data = png(colour())
     gamma = bytes.fromhex("0000000467414d41000186a031e8965f")  # gAMA 1.0 with its checksum
     path = written(tmp_path, data[:33] + gamma + data[33:])
-    assert np.array_equal(images.decode_grey(path, SIZE), images.decode_grey(written(tmp_path, data, "plain.png"), SIZE))
+    assert np.array_equal(grey(path), grey(written(tmp_path, data, "plain.png")))
 
 
 def test_rgb_has_red_first_and_depth_is_raw(tmp_path: Path) -> None:
     bgr, raw = colour(), depth()
-    assert np.array_equal(images.decode_rgb(written(tmp_path, png(bgr)), SIZE), bgr[..., ::-1])
-    assert np.array_equal(images.decode_depth(written(tmp_path, png(raw)), SIZE), raw)
+    assert np.array_equal(rgb(written(tmp_path, png(bgr))), bgr[..., ::-1])
+    assert np.array_equal(raw_depth(written(tmp_path, png(raw))), raw)
 
 
 def test_grey_picture_serves_as_colour(tmp_path: Path) -> None:
-    grey = colour()[..., 0]
-    path = written(tmp_path, png(grey))
-    assert np.array_equal(images.decode_grey(path, SIZE), grey)
-    assert np.array_equal(images.decode_rgb(path, SIZE)[..., 1], grey)
+    luma = colour()[..., 0]
+    path = written(tmp_path, png(luma))
+    assert np.array_equal(grey(path), luma)
+    assert np.array_equal(rgb(path)[..., 1], luma)
 
 
 @pytest.mark.parametrize(("suffix", "size"), [(".png", (64, 48)), (".jpg", (64, 48)), (".bmp", None)])
@@ -67,7 +79,7 @@ def test_truncated_files_are_bad_frames(tmp_path: Path, suffix: str, share: floa
     data = png(colour(), suffix)
     path = written(tmp_path, data[: int(share * len(data))], f"image{suffix}")
     with pytest.raises(BadFrame, match="image"):
-        images.decode_grey(path, SIZE)
+        grey(path)
 
 
 def damaged(data: bytes) -> bytes:
@@ -89,17 +101,17 @@ def damaged(data: bytes) -> bytes:
 )
 def test_unusable_depth_is_told(tmp_path: Path, data: bytes, said: str) -> None:
     with pytest.raises(BadFrame, match=said):
-        images.decode_depth(written(tmp_path, data, "depth.png"), SIZE)
+        raw_depth(written(tmp_path, data, "depth.png"))
 
 
 def test_huge_header_is_refused_before_memory_is_reserved(tmp_path: Path) -> None:
     data = bytearray(png(depth()))
     data[16:24] = (2**30).to_bytes(4, "big") * 2
     with pytest.raises(BadFrame, match="1073741824 x 1073741824"):
-        images.decode_depth(written(tmp_path, bytes(data)), SIZE)
+        raw_depth(written(tmp_path, bytes(data)))
 
 
 def test_missing_file_and_folder_are_bad_frames(tmp_path: Path) -> None:
     for path in (tmp_path / "none.png", tmp_path):
         with pytest.raises(BadFrame, match="cannot be read"):
-            images.decode_grey(path, SIZE)
+            grey(path)

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from click.testing import Result
 
-from slamcli.datasets import open_dataset, silent
+from slamcli.datasets import depth_unit, open_dataset, silent
 from slamcli.datasets.simulate import simulate
 from slamcli.errors import SlamError
-from slamcli.inspection import ERROR, NOTE, WARNING, Inspection, depth_unit, inspect, pictures, registration
+from slamcli.inspection import ERROR, NOTE, WARNING, Inspection, inspect, pictures, registration
 
 Command = Callable[..., Result]
 
@@ -45,7 +45,7 @@ def test_sound_recording_raises_no_alarm(sound: Path) -> None:
     assert found.facts["rate_hz"] == pytest.approx(15.0, abs=0.1)
     assert found.facts["depth_lag_s"] == pytest.approx(0.0, abs=0.015)
     assert max(map(abs, found.facts["depth_shift_px"])) <= 1
-    assert found.facts["depth_step_at_1m"] == pytest.approx(depth_unit.STEP_AT_1M, rel=0.1)
+    assert found.facts["depth_q"] == pytest.approx(depth_unit.KINECT, rel=0.03)
     assert sum(n for _, _, n in found.facts["offset_histogram"]) == 60
 
 

@@ -84,8 +84,8 @@ def test_camera_and_association_are_written_for_other_programs(room: Path, tmp_p
     lines = [line.split() for line in (tmp_path / "extract" / "frames.txt").read_text().splitlines() if not line.startswith("#")]
     assert len(lines) == np.isfinite(features.depth_stamp).sum()
     for stamp, colour, depth_stamp, depth in lines:
-        i = dataset.colour_path.index(colour)
-        assert depth == dataset.depth_path[i]
+        i = dataset.colour_name.index(colour)
+        assert depth == dataset.depth_name[i]
         assert [float(stamp), float(depth_stamp)] == pytest.approx([dataset.stamp[i], dataset.depth_stamp[i]], abs=1e-6)
 
 

@@ -1,0 +1,133 @@
+"""Is the depth scale right? A camera that triangulates betrays it: its readings come in steps that grow with the square of the distance.
+
+Such a camera measures disparity in fractions of a pixel, so neighbouring readings v (in units of 1/u m) differ by ``v^2 / (u q)``, where
+q [1/m] = focal length x baseline x steps per pixel belongs to the camera, whatever the scene. Under a scale that is k times too
+large the same readings show a k times smaller q. Cameras of other kinds, and depth that was resampled, show no such steps.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from slamcli.geometry.camera import DEPTH_VALUES, NO_READING
+
+# q of known cameras. Kinect, Xtion and PrimeSense: 580 px x 75 mm x 8; ICL-NUIM's simulated Kinect is the same. RealSense: x 32; depth
+# at another resolution has another focal length, and keeps the q of its own when it is registered to colour.
+KINECT = 344.0
+CAMERAS = {
+    "Kinect or Xtion": KINECT,
+    "RealSense D435 at 640 x 480": 616.0,
+    "RealSense D435 at 848 x 480": 680.0,
+    "RealSense D435 at 1280 x 720": 1024.0,
+    "RealSense D455 at 640 x 480": 1170.0,
+    "RealSense D455 at 848 x 480": 1292.0,
+    "RealSense D455 at 1280 x 720": 1950.0,
+}
+TOLERANCE = 0.05  # by which q of one kind of camera varies
+COMMON_SCALES = (1000.0, 5000.0, 10000.0, 4000.0, 2000.0, 256.0, 100.0, 6553.5)  # depth units per metre in use, the likelier first
+FACTORS = (4.0, 5.0, 10.0)  # by which a scale is off when it is wrong: millimetres, tenths of them, TUM's 5000, RealSense's 4000
+WINDOWS = np.geomspace(100.0, 60000.0, 64)  # raw readings between which steps are looked for
+LEAST_VALUES = 5  # different readings within a window
+LEAST_WINDOWS = 5
+LEAST_STEP = 4.0  # raw units: smaller steps are rounded too coarsely
+SPREAD = 1.25  # ratio of the constants of windows (80 % to 20 %) up to which they agree
+NEAREST = 0.35  # [m]; a quarter of all readings nearer than this is not a room seen by such a camera
+FARTHEST = 9.0  # [m]; likewise half of all farther
+TYPICAL = (0.5, 6.0)  # [m] median depth of a room
+PERCENTILES = (1, 5, 25, 50, 75, 95, 99)
+
+
+@dataclass(frozen=True)
+class DepthUnit:
+    """The verdict on a depth scale."""
+
+    percentiles: dict[str, float]  # [m] of the readings as they are
+    q: float | None  # [1/m] under the scale as it is, None where readings show no disparity steps
+    camera: str  # whose q that is, "" = of none known
+    likely_scale: float | None  # depth units per metre, where another one fits much better
+    reason: str
+
+
+def counted(images: Iterable[np.ndarray]) -> np.ndarray:
+    """Count the readings of each raw value in depth images (h, w) uint16, (65536,); readings that mean none are left out."""
+    counts = np.zeros(DEPTH_VALUES, dtype=np.int64)
+    for raw in images:
+        counts += np.bincount(raw.ravel(), minlength=DEPTH_VALUES)
+    counts[list(NO_READING)] = 0
+    return counts
+
+
+def judge(counts: np.ndarray, scale: float) -> DepthUnit:
+    """Judge a depth scale from the readings of each raw value, (65536,)."""
+    counts = counts.copy()
+    counts[list(NO_READING)] = 0
+    n = int(counts.sum())
+    if n == 0:
+        return DepthUnit({}, None, "", None, "no reading")
+    share = np.cumsum(counts) / n
+    percentiles = {f"p{p:02d}": float(np.searchsorted(share, p / 100) / scale) for p in PERCENTILES}
+    constant = disparity_constant(counts)
+    q = constant / scale if constant is not None else None
+    if q is not None:
+        name = _camera_of(q)
+        if name:
+            return DepthUnit(percentiles, q, name, None, f"the steps between readings are those of a {name}")
+        likely = _likely_scale(constant or 0.0, scale)
+        if likely is not None:
+            name = _camera_of((constant or 0.0) / likely)
+            reason = f"the steps between readings fit a {name} only if distances are {scale / likely:.2g} times as large"
+            return DepthUnit(percentiles, q, name, likely, reason)
+    return _judge_range(percentiles, q, scale)
+
+
+def measure(counts: np.ndarray) -> tuple[float | None, str]:
+    """Find the depth scale of readings from their steps: (depth units per metre, the camera's name); None where they do not show it."""
+    constant = disparity_constant(counts)
+    if constant is not None:
+        for scale in COMMON_SCALES:
+            name = _camera_of(constant / scale)
+            if name:
+                return scale, name
+    return None, ""
+
+
+def disparity_constant(counts: np.ndarray) -> float | None:
+    """Measure u q = v^2 / step in raw units; None where the readings do not come in steps that grow with the square of the distance."""
+    used = np.flatnonzero(counts > max(3.0, 1e-7 * counts.sum()))
+    constants = []
+    for low, high in zip(WINDOWS[:-1], WINDOWS[1:], strict=True):
+        values = used[(used >= low) & (used < high)].astype(np.float64)
+        if len(values) >= LEAST_VALUES:
+            step = np.diff(values)
+            usual = step[step < 1.6 * np.median(step)]  # a reading that does not occur leaves a double step
+            if usual.mean() >= LEAST_STEP:
+                constants.append(float(np.median(values)) ** 2 / float(usual.mean()))
+    if len(constants) < LEAST_WINDOWS:
+        return None
+    low, middle, high = np.percentile(constants, [20, 50, 80])
+    return float(middle) if high < SPREAD * low else None
+
+
+def _camera_of(q: float) -> str:
+    return next((name for name, known in CAMERAS.items() if abs(q / known - 1.0) <= TOLERANCE), "")
+
+
+def _likely_scale(constant: float, scale: float) -> float | None:
+    """Find the scale under which readings are a known camera's, if the present one is off by a usual factor."""
+    for other in COMMON_SCALES:
+        ratio = max(other / scale, scale / other)
+        if any(abs(ratio / factor - 1.0) < 0.06 for factor in FACTORS) and _camera_of(constant / other):
+            return other
+    return None
+
+
+def _judge_range(percentiles: dict[str, float], q: float | None, scale: float) -> DepthUnit:
+    likely, reason = None, "the range of the readings is that of a room"
+    if percentiles["p25"] < NEAREST and scale > COMMON_SCALES[0]:
+        likely, reason = 1000.0, f"a quarter of all readings is nearer than {percentiles['p25']:.2f} m, where such cameras are blind"
+    elif percentiles["p50"] > FARTHEST:
+        raw = percentiles["p50"] * scale
+        likely = next((other for other in COMMON_SCALES if TYPICAL[0] <= raw / other <= TYPICAL[1]), None)
+        reason = f"half of all readings is farther than {percentiles['p50']:.1f} m, which no room is"
+    return DepthUnit(percentiles, q, "", likely if likely != scale else None, reason)

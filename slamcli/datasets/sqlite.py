@@ -1,0 +1,71 @@
+"""Images that lie in an SQLite file, read by their row; the file is never written to."""
+
+import sqlite3
+import threading
+from collections.abc import Callable, Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from slamcli.datasets.images import check_whole
+from slamcli.errors import BadFrame, SlamError
+
+MAX_BLOB = 256 << 20  # bytes of one image
+
+
+def query(path: Path, text: str, *, what: str) -> list[tuple[Any, ...]]:
+    """Run a query on a file opened for reading; SlamError where the file is not what it should be."""
+    try:
+        with _connect(path) as connection:
+            return connection.execute(text).fetchall()
+    except sqlite3.Error as error:
+        raise SlamError(f"{path}: is not {what}, or is damaged ({error})") from error
+
+
+class Blobs:
+    """Images of a column."""
+
+    def __init__(
+        self,
+        path: Path,
+        text: str,
+        keys: Sequence[int],
+        sizes: Sequence[int],
+        label: str,
+        decode: Callable[[bytes, str], bytes | np.ndarray] | None = None,
+    ) -> None:
+        self.path, self._text, self._keys, self._sizes, self._label, self._decode = path, text, keys, sizes, label, decode
+        self._local = threading.local()  # a connection belongs to one thread
+
+    @cached_property
+    def names(self) -> list[str]:
+        """Name images by key."""
+        return [f"{self._label}#{key}" for key in self._keys]
+
+    def where(self, i: int) -> str:
+        """Name the file and the key."""
+        return f"{self.path}:{self.names[i]}"
+
+    def n_bytes(self, i: int) -> int:
+        """Give the size of the blob."""
+        return int(self._sizes[i])
+
+    def read(self, i: int) -> bytes | np.ndarray:
+        """Fetch and unpack one image."""
+        if self._sizes[i] > MAX_BLOB:
+            raise BadFrame(f"{self.where(i)}: {self._sizes[i] >> 20} MB is too large for an image")
+        try:
+            if not hasattr(self._local, "connection"):
+                self._local.connection = _connect(self.path)
+            row = self._local.connection.execute(self._text, (self._keys[i],)).fetchone()
+        except sqlite3.Error as error:
+            raise BadFrame(f"{self.where(i)}: cannot be read ({error})") from error
+        data = bytes(row[0]) if row and row[0] is not None else b""
+        check_whole(data, self.where(i))
+        return self._decode(data, self.where(i)) if self._decode else data
+
+
+def _connect(path: Path) -> sqlite3.Connection:
+    return sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro&immutable=1", uri=True, check_same_thread=False)

@@ -1,0 +1,148 @@
+"""Depth of one camera seen by another: registered to the colour camera, or brought to the size of its pictures."""
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numba import f4, f8, i8
+
+from slamcli.geometry.camera import EQUIDISTANT, Camera
+from slamcli.jit.kernel import kernel
+
+OVERLAP = 1.1  # by which the footprints of neighbouring readings overlap, so that a slanted surface shows no holes
+SURFACE = 0.03  # relative difference up to which neighbouring readings are of one surface
+
+
+@dataclass(frozen=True)
+class Registration:
+    """Where the depth camera sits, and what it must be brought to."""
+
+    depth_camera: Camera
+    colour_camera: Camera
+    T_cd: np.ndarray  # (4, 4) float64, depth camera to colour camera
+
+    @cached_property
+    def _ray(self) -> np.ndarray:
+        """Give per pixel of the depth camera its ray in the colour camera's axes, (h, w, 3) float32: x_c = depth * ray + t."""
+        ray = np.ones((self.depth_camera.height, self.depth_camera.width, 3))
+        ray[..., :2] = self.depth_camera.rays
+        return np.ascontiguousarray((ray @ self.T_cd[:3, :3].T).astype(np.float32))
+
+    def apply(self, depth: np.ndarray) -> np.ndarray:
+        """Give depth (h, w) float32 [m] of the depth camera as the colour camera would see it, (H, W) float32, NaN = none.
+
+        Each reading covers its footprint among the raw pixels of the colour camera; where several do, the nearest counts.
+        """
+        to = self.colour_camera
+        out = np.full((to.height, to.width), np.inf, dtype=np.float32)
+        magnification = np.array([to.fx / self.depth_camera.fx, to.fy / self.depth_camera.fy]) * (0.5 * OVERLAP)
+        lens = 2 if to.lens == EQUIDISTANT else 3 if to.is_rational else 1 if to.is_distorted else 0
+        intrinsics = np.array([to.fx, to.fy, to.cx, to.cy])
+        splat(np.ascontiguousarray(depth), self._ray, self.T_cd[:3, 3].copy(), intrinsics, lens, to.coefficients, magnification, out)
+        return out
+
+
+def resized(depth: np.ndarray, width: int, height: int) -> np.ndarray:
+    """Bring depth (h, w) float32 [m] to another size of the same field of view, (height, width) float32, NaN = none.
+
+    Readings of one surface are interpolated; at a jump of depth the nearest pixel's counts, so that nothing floats in between.
+    """
+    if depth.shape == (height, width):
+        return depth
+    out = np.empty((height, width), dtype=np.float32)
+    resample(np.ascontiguousarray(depth), out)
+    return out
+
+
+@kernel
+def bend(x, y, lens, k):
+    """Give the point (x, y) of the plane z = 1 as the lens maps it.
+
+    lens : 1 polynomial, 2 equidistant, 3 rational; k : (8,) as in Camera.coefficients
+    """
+    r2 = x * x + y * y
+    if lens == 2:
+        r = math.sqrt(r2)
+        if r < 1e-9:
+            return x, y
+        t = math.atan(r)
+        t2 = t * t
+        factor = t * (1.0 + t2 * (k[0] + t2 * (k[1] + t2 * (k[4] + t2 * k[5])))) / r
+        return x * factor, y * factor
+    radial = 1.0 + r2 * (k[0] + r2 * (k[1] + r2 * k[4]))
+    if lens == 3:
+        radial /= 1.0 + r2 * (k[5] + r2 * (k[6] + r2 * k[7]))
+    bent_x = x * radial + 2.0 * k[2] * x * y + k[3] * (r2 + 2.0 * x * x)
+    bent_y = y * radial + k[2] * (r2 + 2.0 * y * y) + 2.0 * k[3] * x * y
+    return bent_x, bent_y
+
+
+@kernel
+def splat(
+    depth: f4[:, ::1],
+    ray: f4[:, :, ::1],
+    t: f8[::1],
+    intrinsics: f8[::1],
+    lens: i8,
+    k: f8[::1],
+    half: f8[::1],
+    out: f4[:, ::1],
+):
+    """Lay each reading of `depth` on `out` (H, W), filled with inf before; the nearest wins, and what is left uncovered becomes NaN.
+
+    ray (h, w, 3), t (3,): x_c = depth * ray + t. half (2,): half a footprint's width and height [px] at equal distances.
+    """
+    fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
+    rows, columns = out.shape
+    for i in range(depth.shape[0]):
+        for j in range(depth.shape[1]):
+            d = f8(depth[i, j])
+            if not d > 0.0:
+                continue
+            z = d * ray[i, j, 2] + t[2]
+            if not z > 0.0:
+                continue
+            inverse = 1.0 / z
+            x, y = (d * ray[i, j, 0] + t[0]) * inverse, (d * ray[i, j, 1] + t[1]) * inverse
+            if lens != 0:
+                x, y = bend(x, y, lens, k)
+            u, v, size = fx * x + cx, fy * y + cy, d * inverse
+            half_u, half_v = half[0] * size, half[1] * size
+            if not (u > -0.5 and v > -0.5 and u < columns - 0.5 and v < rows - 0.5):
+                continue
+            half_u, half_v = min(half_u, u + 1.0), min(half_v, v + 1.0)
+            left, right = int(u - half_u + 1.0), min(int(u + half_u), columns - 1)  # u - half_u > -1 here: truncation rounds down
+            top, bottom = int(v - half_v + 1.0), min(int(v + half_v), rows - 1)
+            near = f4(z)
+            for row in range(top, bottom + 1):
+                for column in range(left, right + 1):
+                    if near < out[row, column]:
+                        out[row, column] = near
+    for row in range(rows):
+        for column in range(columns):
+            if out[row, column] == np.inf:
+                out[row, column] = np.nan
+
+
+@kernel
+def resample(depth: f4[:, ::1], out: f4[:, ::1]):
+    """Fill `out` (H, W) with `depth` (h, w) in its size, pixel centres on whole numbers in both."""
+    rows, columns = depth.shape
+    across, down = columns / out.shape[1], rows / out.shape[0]
+    for i in range(out.shape[0]):
+        v = min(max((i + 0.5) * down - 0.5, 0.0), rows - 1.0)
+        top = min(int(v), max(rows - 2, 0))
+        bottom = min(top + 1, rows - 1)
+        b = v - top
+        for j in range(out.shape[1]):
+            u = min(max((j + 0.5) * across - 0.5, 0.0), columns - 1.0)
+            left = min(int(u), max(columns - 2, 0))
+            right = min(left + 1, columns - 1)
+            a = u - left
+            p, q, r, s = depth[top, left], depth[top, right], depth[bottom, left], depth[bottom, right]
+            low, high = min(min(p, q), min(r, s)), max(max(p, q), max(r, s))
+            if p == p and q == q and r == r and s == s and high - low <= SURFACE * low:
+                out[i, j] = (1.0 - b) * ((1.0 - a) * p + a * q) + b * ((1.0 - a) * r + a * s)
+            else:
+                out[i, j] = depth[bottom if b >= 0.5 else top, right if a >= 0.5 else left]
