@@ -29,7 +29,7 @@ PACKAGES = (
     "dense",
     "navigation",
 )  # that hold the kernels of a run
-CHILD = "import sys; from slamcli import compilation; compilation.compile_share(int(sys.argv[1]), int(sys.argv[2]))"
+CHILD = "import sys; from slamcli.jit import compilation; compilation.compile_share(int(sys.argv[1]), int(sys.argv[2]))"
 MOST_PROCESSES = 8
 log = logging.getLogger(__name__)
 

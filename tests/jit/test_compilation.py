@@ -85,3 +85,11 @@ def test_an_interruption_ends_the_processes_that_compile(monkeypatch: pytest.Mon
     names.close()
     with pytest.raises(ProcessLookupError):
         os.kill(pid, 0)
+
+
+def test_a_process_compiles_its_share_and_names_it() -> None:
+    home = Path(compilation.__file__).parents[2]
+    command = [sys.executable, "-c", compilation.CHILD, "0", str(len(compilation.declared()))]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, cwd=home)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split() == [compilation.declared()[0].py_func.__qualname__]
