@@ -11,10 +11,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from slamcli.datasets import png
 from slamcli.errors import BadFrame
 
 MAX_BYTES = 256 << 20  # of one image file
-PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 JPEG_MAGIC = b"\xff\xd8\xff"
 JPEG_SIZE_MARKERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # SOF0..15 without DHT, JPG, DAC
 JPEG_BARE_MARKERS = frozenset({0x01, *range(0xD0, 0xD9)})  # carry no length
@@ -31,7 +31,7 @@ def read_bytes(path: Path) -> bytes:
         raise BadFrame(f"{path}: cannot be read ({error.strerror})") from error
     if not data:
         raise BadFrame(f"{path}: is empty (0 bytes)")
-    if data.startswith(PNG_MAGIC) and b"IEND" not in data[-64:]:
+    if data.startswith(png.MAGIC) and b"IEND" not in data[-64:]:
         raise BadFrame(f"{path}: PNG is cut off")
     # Decoders fill the missing part of a JPEG with grey and go on; trailing bytes after the end marker are common and harmless.
     if data.startswith(JPEG_MAGIC) and b"\xff\xd9" not in data[-4096:]:
@@ -41,7 +41,7 @@ def read_bytes(path: Path) -> bytes:
 
 def image_size(data: bytes) -> tuple[int, int] | None:
     """Read (width, height) from the header of a PNG or JPEG; None for other formats and for broken headers."""
-    if data.startswith(PNG_MAGIC) and len(data) >= 24:
+    if data.startswith(png.MAGIC) and len(data) >= 24:
         return struct.unpack(">II", data[16:24])
     if not data.startswith(JPEG_MAGIC):
         return None
@@ -65,17 +65,26 @@ def decode_grey(path: Path, size: tuple[int, int]) -> np.ndarray:
     data = _checked(path, size)
     if data.startswith(JPEG_MAGIC):
         return _decode(path, data, cv2.IMREAD_GRAYSCALE, size)
+    rgb = png.rgb(data, size)
+    if rgb is not None:
+        return cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
     return cv2.cvtColor(_decode(path, data, cv2.IMREAD_COLOR, size), cv2.COLOR_BGR2GRAY)
 
 
 def decode_rgb(path: Path, size: tuple[int, int]) -> np.ndarray:
     """Give the colour image, (height, width, 3) uint8, red first."""
-    return cv2.cvtColor(_decode(path, _checked(path, size), cv2.IMREAD_COLOR, size), cv2.COLOR_BGR2RGB)
+    data = _checked(path, size)
+    rgb = png.rgb(data, size)
+    return cv2.cvtColor(_decode(path, data, cv2.IMREAD_COLOR, size), cv2.COLOR_BGR2RGB) if rgb is None else rgb
 
 
 def decode_depth(path: Path, size: tuple[int, int]) -> np.ndarray:
     """Give the raw depth image, (height, width) uint16; BadFrame for any other pixel type, 8 bits above all."""
-    raw = _decode(path, _checked(path, size), cv2.IMREAD_UNCHANGED, size)
+    data = _checked(path, size)
+    raw = png.grey_16(data, size)
+    if raw is not None:
+        return raw
+    raw = _decode(path, data, cv2.IMREAD_UNCHANGED, size)
     if raw.ndim != 2:
         raise BadFrame(f"{path}: has {raw.shape[2]} channels; depth must be a one-channel image of 16 bits")
     if raw.dtype != np.uint16:
