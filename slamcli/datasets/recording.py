@@ -49,7 +49,8 @@ class Dataset:
         """
         if not self.depth_path[i]:
             return None
-        return (camera or self.camera).metres[images.decode_depth(self.root / self.depth_path[i], self._size)]
+        raw = images.decode_depth(self.root / self.depth_path[i], self._size)
+        return images.metres(raw, (camera or self.camera).metres)
 
     def ground_truth(self) -> Trajectory | None:
         """Give the true camera-to-world poses, None where the recording has none."""

@@ -103,3 +103,13 @@ def test_missing_file_and_folder_are_bad_frames(tmp_path: Path) -> None:
     for path in (tmp_path / "none.png", tmp_path):
         with pytest.raises(BadFrame, match="cannot be read"):
             images.decode_grey(path, SIZE)
+
+
+def test_metres_are_what_indexing_the_table_gives() -> None:
+    rng = np.random.default_rng(0)
+    table = rng.normal(size=1 << 16).astype(np.float32)
+    table[0] = np.nan
+    raw = rng.integers(0, 1 << 16, size=(31, 17)).astype(np.uint16)
+    raw[0, :3] = 0, 1, (1 << 16) - 1
+    assert np.array_equal(images.metres(raw, table), table[raw], equal_nan=True)
+    assert np.array_equal(images.metres(raw.T, table), table[raw.T], equal_nan=True)
