@@ -44,12 +44,26 @@ class Candidates:
 def sort_into_buckets(xy: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     """Sort features (N, 2) px by square buckets of the image; those undistorted beyond its rim go to the bucket next to them."""
     columns, rows = -(-camera.width // CELL), -(-camera.height // CELL)
-    column = np.clip(xy[:, 0] // CELL, 0, columns - 1).astype(np.int32)
-    row = np.clip(xy[:, 1] // CELL, 0, rows - 1).astype(np.int32)
-    bucket = row * columns + column
-    start = np.zeros(columns * rows + 1, dtype=np.int32)
-    np.cumsum(np.bincount(bucket, minlength=columns * rows), out=start[1:])
-    return start, np.argsort(bucket, kind="stable").astype(np.int32)
+    start, order = np.zeros(columns * rows + 1, dtype=np.int32), np.empty(len(xy), dtype=np.int32)
+    _sort_into_buckets(xy, columns, rows, start, order)
+    return start, order
+
+
+@kernel
+def _sort_into_buckets(xy: f4[:, ::1], columns: i8, rows: i8, start: i4[::1], order: i4[::1]):
+    """Fill start (columns rows + 1,), 0, and order (N,): rows of xy (N, 2) sorted by bucket, in a bucket increasing."""
+    bucket = np.empty(len(xy), dtype=np.int32)
+    for k in range(len(xy)):
+        column = min(max(int(np.floor(float(xy[k, 0]) / CELL)), 0), columns - 1)
+        row = min(max(int(np.floor(float(xy[k, 1]) / CELL)), 0), rows - 1)
+        bucket[k] = row * columns + column
+        start[bucket[k] + 1] += 1
+    for b in range(columns * rows):
+        start[b + 1] += start[b]
+    place = start.copy()
+    for k in range(len(xy)):
+        order[place[bucket[k]]] = k
+        place[bucket[k]] += 1
 
 
 def search(
