@@ -8,15 +8,16 @@ depth delay, and from the camera's own motion; `rectify` takes them out.
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numba import b1, f4, f8, i8
 
 from slamcli.geometry import se3
 from slamcli.geometry.camera import Camera
+from slamcli.jit.kernel import kernel
 from slamcli.schema import Features, Map, Timing, Tracks, frame_poses
 
 REACH = 2  # frames on either side from which a frame's motion is read
 MAX_GAP = 0.15  # s, between a frame and those: over more the motion is not steady
 FAR = 4.0  # m, depth assumed where none was read: there only the rotation moves a pixel noticeably
-ROWS_AT_ONCE = 1 << 18  # features rectified together: the intermediate results of a long recording would fill the memory
 LARGEST_GAP = 0.2  # [s] between neighbouring frames; over a longer one the motion is anybody's guess
 
 
@@ -87,18 +88,54 @@ def rectify(features: Features, timing: Timing, camera: Camera) -> Features:
     slanted surface that is another point. The reading has changed by t times what the point's depth does less what the slant makes of
     the point's way through the image.
     """
-    xy, depth, lag = np.array(features.xy), np.array(features.depth), depth_lag(features, timing)
-    for start in range(0, len(xy), ROWS_AT_ONCE):
-        rows = np.arange(start, min(start + ROWS_AT_ONCE, len(xy)))
-        moving = flow(features, timing.twist, camera, rows)
-        row_later = moving.share * float(timing.readout)
-        xy[rows] -= moving.px_per_s * row_later[:, None]
-        if np.isnan(timing.depth_delay):
-            continue
-        read_later = lag[np.searchsorted(features.offset, rows, side="right") - 1] + moving.share * float(timing.depth_readout)
-        z = depth[rows] - moving.reading_per_s * read_later - moving.slant_per_s * row_later
-        depth[rows] = np.where(z > 0.0, z, np.nan)
+    xy, depth = np.array(features.xy), np.array(features.depth)
+    _rectify(
+        np.array(features.offset, dtype=np.int64),
+        np.ascontiguousarray(timing.twist, dtype=np.float64),
+        depth_lag(features, timing),
+        np.array([camera.fx, camera.fy, camera.cx, camera.cy, camera.height], dtype=np.float64),
+        float(timing.readout),
+        float(timing.depth_readout),
+        not np.isnan(timing.depth_delay),
+        np.ascontiguousarray(features.slope),
+        xy,
+        depth,
+    )
     return replace(features, xy=xy, depth=depth)
+
+
+@kernel(error_model="numpy")
+def _rectify(
+    offset: i8[::1],
+    twist: f8[:, ::1],
+    lag: f8[::1],
+    camera: f8[::1],
+    readout: f8,
+    depth_readout: f8,
+    moves_depth: b1,
+    slope: f4[:, ::1],
+    xy: f4[:, ::1],
+    depth: f4[::1],
+):
+    """Move xy (N, 2) [px] and depth (N,) [m] in place to what `flow` says of them at the colour stamp.
+
+    offset : (F + 1,) rows of each frame; lag : (F,) [s]; camera : fx, fy, cx, cy, height
+    """
+    fx, fy, cx, cy, height = camera[0], camera[1], camera[2], camera[3], camera[4]
+    for frame in range(len(offset) - 1):
+        t0, t1, t2, w0, w1, w2 = twist[frame, 0], twist[frame, 1], twist[frame, 2], twist[frame, 3], twist[frame, 4], twist[frame, 5]
+        for row in range(offset[frame], offset[frame + 1]):
+            u, v, d = float(xy[row, 0]), float(xy[row, 1]), float(depth[row])
+            z = d if np.isfinite(d) else FAR
+            x, y = (u - cx) / fx * z, (v - cy) / fy * z
+            vx, vy, vz = -(t0 + (w1 * z - w2 * y)), -(t1 + (w2 * x - w0 * z)), -(t2 + (w0 * y - w1 * x))
+            du, dv = fx * (vx - x / z * vz) / z, fy * (vy - y / z * vz) / z
+            share = v / height - 0.5
+            xy[row, 0], xy[row, 1] = u - du * (share * readout), v - dv * (share * readout)
+            if moves_depth:
+                slant = -(z * z) * (float(slope[row, 0]) * du + float(slope[row, 1]) * dv)
+                later = d - (vz - slant) * (lag[frame] + share * depth_readout) - slant * (share * readout)
+                depth[row] = later if later > 0.0 else np.nan
 
 
 def depth_lag(features: Features, timing: Timing) -> np.ndarray:

@@ -18,6 +18,7 @@ from slamcli.sparse_map.sparse_map import MapBuilder
 
 TIMES = "readout", "depth_readout", "depth_delay"  # fields of Timing that are looked for
 SIGNIFICANT = 3.0  # standard deviations
+ROWS_AT_ONCE = 1 << 18  # features recalibrated together: the intermediate results of a long recording would fill the memory
 STEP = 1e-3  # of its prior sigma, by which an unknown of the calibration is moved to see what that does
 
 
@@ -57,8 +58,8 @@ def recalibrate(features: Features, given: Camera, camera: Camera) -> Features:
     if camera == given:
         return features
     xy = np.empty_like(features.xy)
-    for start in range(0, len(xy), rolling_shutter.ROWS_AT_ONCE):
-        part = slice(start, start + rolling_shutter.ROWS_AT_ONCE)
+    for start in range(0, len(xy), ROWS_AT_ONCE):
+        part = slice(start, start + ROWS_AT_ONCE)
         xy[part] = camera.undistort(given.distort(features.xy[part]))
     slope = features.slope * np.float32(camera.depth_scale / given.depth_scale)
     return replace(features, xy=xy, depth=camera.reread(features.depth, given), slope=slope)

@@ -12,11 +12,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from slamcli.datasets import png
 from slamcli.errors import BadFrame
 
 MAX_BYTES = 256 << 20  # of one image file
 MAX_PIXELS = 100_000_000  # of one image
-PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 JPEG_MAGIC = b"\xff\xd8\xff"
 EXR_MAGIC = b"\x76\x2f\x31\x01"
 NPY_MAGIC = b"\x93NUMPY"
@@ -83,7 +83,7 @@ def check_whole(data: bytes, name: str) -> None:
     """Raise BadFrame for an encoded image that is empty or cut off."""
     if not data:
         raise BadFrame(f"{name}: is empty (0 bytes)")
-    if data.startswith(PNG_MAGIC) and b"IEND" not in data[-64:]:
+    if data.startswith(png.MAGIC) and b"IEND" not in data[-64:]:
         raise BadFrame(f"{name}: PNG is cut off")
     # Decoders fill the missing part of a JPEG with grey and go on; trailing bytes after the end marker are common and harmless.
     if data.startswith(JPEG_MAGIC) and b"\xff\xd9" not in data[-4096:]:
@@ -92,7 +92,7 @@ def check_whole(data: bytes, name: str) -> None:
 
 def image_size(data: bytes) -> tuple[int, int] | None:
     """Read (width, height) from the header of a PNG or JPEG; None for other formats and for broken headers."""
-    if data.startswith(PNG_MAGIC) and len(data) >= 24:
+    if data.startswith(png.MAGIC) and len(data) >= 24:
         return struct.unpack(">II", data[16:24])
     if not data.startswith(JPEG_MAGIC):
         return None
@@ -130,6 +130,9 @@ def decode_grey(picture: Picture, size: tuple[int, int], *, name: str, reduction
     if picture.startswith(JPEG_MAGIC):
         flags = REDUCED.get(_power(reduction), cv2.IMREAD_GRAYSCALE)
         return _reduced(_decode(picture, flags, name, None if flags in REDUCED.values() else size), size, reduction)
+    rgb = png.rgb(picture, size)
+    if rgb is not None:
+        return _reduced(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), size, reduction)
     return _reduced(cv2.cvtColor(_decode(picture, cv2.IMREAD_COLOR, name, size), cv2.COLOR_BGR2GRAY), size, reduction)
 
 
@@ -138,6 +141,9 @@ def decode_rgb(picture: Picture, size: tuple[int, int], *, name: str, reduction:
     if isinstance(picture, Pixels):
         return _reduced(_converted(picture, 1, size, name), size, reduction)
     _check_size(picture, size, name)
+    rgb = png.rgb(picture, size)
+    if rgb is not None:
+        return _reduced(rgb, size, reduction)
     flags = REDUCED_COLOUR.get(_power(reduction), cv2.IMREAD_COLOR) if picture.startswith(JPEG_MAGIC) else cv2.IMREAD_COLOR
     image = _decode(picture, flags, name, size if flags == cv2.IMREAD_COLOR else None)
     return cv2.cvtColor(_reduced(image, size, reduction), cv2.COLOR_BGR2RGB)
@@ -156,7 +162,8 @@ def decode_depth(data: bytes, size: tuple[int, int] | None = None, *, name: str)
     elif data.startswith(NPY_MAGIC):
         raw = decode_npy(data, name)
     else:
-        raw = _decode(data, cv2.IMREAD_UNCHANGED, name)
+        grey = png.grey_16(data, size or image_size(data) or (0, 0))
+        raw = _decode(data, cv2.IMREAD_UNCHANGED, name) if grey is None else grey
     return checked_depth(raw, size, name=name)
 
 

@@ -12,7 +12,6 @@ import numpy as np
 from slamcli.errors import SlamError
 from slamcli.geometry.camera import EQUIDISTANT
 
-
 MAX_BYTES = 1 << 20
 KEYS = "width height fx fy cx cy k1 k2 p1 p2 k3 depth_scale inverse_depth_offset k4 k5 k6 lens"
 DEPTH_KEYS = frozenset(["width", "height", "fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "lens"])

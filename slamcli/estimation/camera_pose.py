@@ -113,24 +113,17 @@ def refine_pose(
     nothing changes. Observations with a value that is not finite are outliers. Huber's kernel acts on an observation as a whole, from
     the same chi2 on.
     """
-    x_w, xy, depth = _points(x_w), _cast(xy), _cast(depth)
-    with np.errstate(divide="ignore"):
-        inv_px, inv_z = 1.0 / _cast(sigma_px), 1.0 / _cast(sigma_z)
-    with np.errstate(invalid="ignore"):  # a sum is finite when all its terms are, and five times as fast to find out
-        is_valid = np.isfinite(x_w[:, 0] + x_w[:, 1] + x_w[:, 2] + xy[:, 0] + xy[:, 1] + inv_px)
-    if not is_valid.all():
-        x_w = np.where(is_valid[:, None], x_w, np.nan)  # never in front of the camera: an outlier from the start
-    depth = np.where(np.isfinite(inv_z) & np.isfinite(depth), depth, np.nan)
-    start, is_inlier = se3.orthonormalise(T_cw), is_valid.copy()
-    T, H, cost, total = kernels.refine(
-        start, x_w, xy, depth, inv_px, inv_z, _intrinsics(camera), chi2_px, chi2_depth, huber, rounds, iterations, is_inlier
+    start, is_inlier = se3.orthonormalise(T_cw), np.empty(len(x_w), dtype=np.bool_)
+    measured = (_cast(xy), _cast(depth), _cast(sigma_px), _cast(sigma_z))
+    T, H, cost, total, rms = kernels.refine(
+        start, _points(x_w), *measured, _intrinsics(camera), chi2_px, chi2_depth, huber, rounds, iterations, is_inlier
     )
     return PoseEstimate(
         T_cw=T,
         is_inlier=is_inlier,
-        n_inliers=int(is_inlier.sum()),
-        information=np.triu(H) + np.triu(H, 1).T,
-        rms=_rms(T, x_w, _rays(xy, camera), camera, is_inlier),
+        n_inliers=int(np.count_nonzero(is_inlier)),
+        information=H,
+        rms=rms,
         cost=cost,
         iterations=total,
     )

@@ -158,13 +158,27 @@ def normal_equations(T, x_w, xy, depth, inv_px, inv_z, is_used, camera, chi2_px,
 
 
 @kernel(error_model="numpy", fastmath={"contract"})
+def _rms(T, x_w, xy, camera, is_inlier):
+    """Compute the root mean square reprojection error [px] of the inliers, NaN without any."""
+    total, n = 0.0, 0
+    for i in range(len(x_w)):
+        if is_inlier[i]:
+            z = T[2, 0] * x_w[i, 0] + T[2, 1] * x_w[i, 1] + T[2, 2] * x_w[i, 2] + T[2, 3]
+            du = camera[0] * (T[0, 0] * x_w[i, 0] + T[0, 1] * x_w[i, 1] + T[0, 2] * x_w[i, 2] + T[0, 3]) / z + camera[2] - xy[i, 0]
+            dv = camera[1] * (T[1, 0] * x_w[i, 0] + T[1, 1] * x_w[i, 1] + T[1, 2] * x_w[i, 2] + T[1, 3]) / z + camera[3] - xy[i, 1]
+            total += du * du + dv * dv
+            n += 1
+    return np.sqrt(total / n)
+
+
+@kernel(error_model="numpy", fastmath={"contract"})
 def refine(
     T: f8[:, ::1],
-    x_w: f8[:, ::1],
+    given_x_w: f8[:, ::1],
     xy: f8[:, ::1],
-    depth: f8[::1],
-    inv_px: f8[::1],
-    inv_z: f8[::1],
+    given_depth: f8[::1],
+    sigma_px: f8[::1],
+    sigma_z: f8[::1],
     camera: f8[::1],
     chi2_px: f8,
     chi2_depth: f8,
@@ -175,9 +189,19 @@ def refine(
 ):
     """Levenberg-Marquardt on T (4, 4), with the inliers (N,) found anew after each round, in place.
 
-    Returns the pose, the upper triangle of its information (6, 6), the robust cost of the inliers, the iterations done.
+    is_inlier : written; an observation with a value that is not finite is never one
+    Returns the pose, its information (6, 6), the robust cost of the inliers, the iterations done, and the root
+    mean square reprojection error [px] of the inliers, NaN without any.
     """
-    n = len(x_w)
+    n = len(given_x_w)
+    x_w, depth, inv_px, inv_z = np.empty((n, 3)), np.empty(n), np.empty(n), np.empty(n)
+    for i in range(n):
+        inv_px[i], inv_z[i] = 1.0 / sigma_px[i], 1.0 / sigma_z[i]
+        # A sum is finite when all its terms are.
+        is_inlier[i] = np.isfinite(given_x_w[i, 0] + given_x_w[i, 1] + given_x_w[i, 2] + xy[i, 0] + xy[i, 1] + inv_px[i])
+        for k in range(3):  # NaN is never in front of the camera: an outlier from the start
+            x_w[i, k] = given_x_w[i, k] if is_inlier[i] else np.nan
+        depth[i] = given_depth[i] if np.isfinite(inv_z[i]) and np.isfinite(given_depth[i]) else np.nan
     trial, H, H_trial, b, b_trial = np.empty((4, 4)), np.empty((6, 6)), np.empty((6, 6)), np.empty(6), np.empty(6)
     chi2, chi2_trial, step, L = np.empty(n), np.empty(n), np.empty(6), np.empty((6, 6))
     total = 0
@@ -220,4 +244,7 @@ def refine(
         if not changed:
             break
         cost = normal_equations(T, x_w, xy, depth, inv_px, inv_z, is_inlier, camera, chi2_px, chi2_depth, robust, chi2, H, b)
-    return T, H, cost, total
+    for i in range(6):
+        for j in range(i):
+            H[i, j] = H[j, i]
+    return T, H, cost, total, _rms(T, x_w, xy, camera, is_inlier)

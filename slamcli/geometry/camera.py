@@ -116,7 +116,9 @@ class Camera:
     def to_metres(self, raw: np.ndarray) -> np.ndarray:
         """Convert readings (...), uint16 or floating, to depth (...) float32 [m], NaN where there is none."""
         if raw.dtype == np.uint16:
-            return self.metres[raw]
+            from slamcli.geometry.lookup import look_up
+
+            return look_up(self.metres, raw)
         read = raw.astype(np.float32) / np.float32(self.depth_scale)
         with np.errstate(invalid="ignore"):
             read[~((read > 0.0) & (read < np.inf))] = np.nan

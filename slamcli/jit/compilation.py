@@ -24,6 +24,7 @@ PACKAGES = (
     "depth",
     "estimation",
     "sparse_map",
+    "datasets",
     "calibration",
     "slam",
     "dense",

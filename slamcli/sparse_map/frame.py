@@ -33,4 +33,5 @@ def frame_features(features: Features, frame: int, camera: Camera, sensor: Senso
 
 def refine_on_landmarks(T_cw: np.ndarray, x_w: np.ndarray, frame: FrameFeatures, rows: np.ndarray, camera: Camera) -> PoseEstimate:
     """Refine a frame's pose on landmarks `x_w` (N, 3) [m, world] seen as its features `rows` (N,)."""
-    return camera_pose.refine_pose(T_cw, x_w, frame.xy[rows], frame.depth[rows], frame.sigma_px[rows], frame.sigma_z[rows], camera)
+    measured = (values.take(rows, axis=0) for values in (frame.xy, frame.depth, frame.sigma_px, frame.sigma_z))
+    return camera_pose.refine_pose(T_cw, x_w, *measured, camera)

@@ -10,6 +10,7 @@ from slamcli.geometry.camera import Camera
 from slamcli.jit.kernel import kernel
 
 CELL = 20  # px, side of the buckets that features are sorted into
+LAST_OCTAVE = 9  # in which a landmark is looked for; one that should appear beyond it is too far away
 
 
 @dataclass(frozen=True)
@@ -44,12 +45,26 @@ class Candidates:
 def sort_into_buckets(xy: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     """Sort features (N, 2) px by square buckets of the image; those undistorted beyond its rim go to the bucket next to them."""
     columns, rows = -(-camera.width // CELL), -(-camera.height // CELL)
-    column = np.clip(xy[:, 0] // CELL, 0, columns - 1).astype(np.int32)
-    row = np.clip(xy[:, 1] // CELL, 0, rows - 1).astype(np.int32)
-    bucket = row * columns + column
-    start = np.zeros(columns * rows + 1, dtype=np.int32)
-    np.cumsum(np.bincount(bucket, minlength=columns * rows), out=start[1:])
-    return start, np.argsort(bucket, kind="stable").astype(np.int32)
+    start, order = np.zeros(columns * rows + 1, dtype=np.int32), np.empty(len(xy), dtype=np.int32)
+    _sort_into_buckets(xy, columns, rows, start, order)
+    return start, order
+
+
+@kernel
+def _sort_into_buckets(xy: f4[:, ::1], columns: i8, rows: i8, start: i4[::1], order: i4[::1]):
+    """Fill start (columns rows + 1,), 0, and order (N,): rows of xy (N, 2) sorted by bucket, in a bucket increasing."""
+    bucket = np.empty(len(xy), dtype=np.int32)
+    for k in range(len(xy)):
+        column = min(max(int(np.floor(float(xy[k, 0]) / CELL)), 0), columns - 1)
+        row = min(max(int(np.floor(float(xy[k, 1]) / CELL)), 0), rows - 1)
+        bucket[k] = row * columns + column
+        start[bucket[k] + 1] += 1
+    for b in range(columns * rows):
+        start[b + 1] += start[b]
+    place = start.copy()
+    for k in range(len(xy)):
+        order[place[bucket[k]]] = k
+        place[bucket[k]] += 1
 
 
 def search(
@@ -122,7 +137,19 @@ def _search(
     centre_x = -(T_cw[0, 0] * T_cw[0, 3] + T_cw[1, 0] * T_cw[1, 3] + T_cw[2, 0] * T_cw[2, 3])
     centre_y = -(T_cw[0, 1] * T_cw[0, 3] + T_cw[1, 1] * T_cw[1, 3] + T_cw[2, 1] * T_cw[2, 3])
     centre_z = -(T_cw[0, 2] * T_cw[0, 3] + T_cw[1, 2] * T_cw[1, 3] + T_cw[2, 2] * T_cw[2, 3])
-    log_scale = np.log(octave_scale)
+    # A landmark is looked for in the octave that it should appear in, rounded; two octaves nearer than ever it still counts as octave 0.
+    power, border = np.empty(LAST_OCTAVE + 1), np.empty(LAST_OCTAVE + 4)
+    for step in range(LAST_OCTAVE + 1):
+        power[step] = octave_scale**step
+    for step in range(LAST_OCTAVE + 4):
+        border[step] = octave_scale ** (step - 2.5)
+    # In the order of the buckets, what one window needs lies side by side: 0.6 times the time.
+    sorted_x, sorted_y, sorted_octave, sorted_desc = np.empty(n), np.empty(n), np.empty(n, np.int64), np.empty((n, 4), np.uint64)
+    for position in range(n):
+        j = bucket_rows[position]
+        sorted_x[position], sorted_y[position], sorted_octave[position] = xy[j, 0], xy[j, 1], octave[j]
+        for i in range(4):
+            sorted_desc[position, i] = desc[j, i]
     for k in range(n_lm):
         x, y, z = xyz[k, 0], xyz[k, 1], xyz[k, 2]
         depth = T_cw[2, 0] * x + T_cw[2, 1] * y + T_cw[2, 2] * z + T_cw[2, 3]
@@ -136,28 +163,29 @@ def _search(
         distance = np.sqrt(dx * dx + dy * dy + dz * dz)
         if dx * direction[k, 0] + dy * direction[k, 1] + dz * direction[k, 2] < 0.5 * distance:
             continue  # seen from more than 60 degrees aside a patch looks different
-        level = int(np.round(np.log(reach[k] / distance) / log_scale))
-        if level < -2 or level > 9:
+        share, level = reach[k] / distance, 0
+        if not border[0] <= share <= border[LAST_OCTAVE + 3]:
             continue  # much nearer or farther than it was ever seen
-        level = max(level, 0)
+        while share > border[level + 3]:
+            level += 1
         is_visible[k] = True
-        radius = radius_px * octave_scale**level
+        radius = radius_px * power[level]
         best, second, best_row, best_octave, second_octave = 257, 257, -1, -1, -1
-        column_to = min(max(int((u + radius) // CELL), 0), columns - 1)
-        column_from = min(max(int((u - radius) // CELL), 0), columns - 1)
-        for row in range(min(max(int((v - radius) // CELL), 0), rows - 1), min(max(int((v + radius) // CELL), 0), rows - 1) + 1):
+        column_to = min(int((u + radius) / CELL), columns - 1)
+        column_from = min(int(max(u - radius, 0.0) / CELL), columns - 1)
+        row_to = min(int((v + radius) / CELL), rows - 1)
+        for row in range(min(int(max(v - radius, 0.0) / CELL), rows - 1), row_to + 1):
             for position in range(bucket_start[row * columns + column_from], bucket_start[row * columns + column_to + 1]):
-                j = bucket_rows[position]
-                if abs(xy[j, 0] - u) > radius or abs(xy[j, 1] - v) > radius:
+                o = sorted_octave[position]
+                is_outside = (abs(sorted_x[position] - u) > radius) | (abs(sorted_y[position] - v) > radius)
+                if is_outside | (o < level - 1) | (o > level + 1):
                     continue
-                if octave[j] < level - 1 or octave[j] > level + 1:
-                    continue
-                bits = int(hamming(lm_desc, k, desc, j))
+                bits = int(hamming(lm_desc, k, sorted_desc, position))
                 if bits < best:
                     second, second_octave = best, best_octave
-                    best, best_octave, best_row = bits, int(octave[j]), j
+                    best, best_octave, best_row = bits, o, bucket_rows[position]
                 elif bits < second:
-                    second, second_octave = bits, int(octave[j])
+                    second, second_octave = bits, o
         if best > max_distance or (best_octave == second_octave and best > ratio * second):
             continue
         if best >= owner_distance[best_row]:

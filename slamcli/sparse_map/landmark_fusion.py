@@ -43,7 +43,5 @@ def fuse_landmarks(builder: MapBuilder, kf: int, ids: np.ndarray, camera: Camera
     there = builder.lm_of_row[frame.first_row + f]
     is_free = there < 0
     builder.observe(kf, ids[which[is_free]], frame.first_row + f[is_free])
-    for kept, gone in zip(there[~is_free], ids[which[~is_free]], strict=True):
-        if builder.lm.is_alive[kept] and builder.lm.is_alive[gone]:
-            builder.fuse(int(kept), int(gone))
+    builder.fuse(there[~is_free], ids[which[~is_free]])
     return len(which)

@@ -1,6 +1,7 @@
 """Bundle adjustment of a part of the growing map, or of all of it."""
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -28,13 +29,21 @@ class Measurements:
 def measure(features: Features, rows: np.ndarray | slice, sensor: SensorConfig) -> Measurements:
     """Look up the measurements of feature `rows` (indices or a slice) with their standard deviations."""
     depth = np.array(features.depth[rows], dtype=np.float64)
-    depth[~((depth >= sensor.depth_min) & (depth <= sensor.depth_max))] = np.nan
+    with np.errstate(invalid="ignore"):
+        np.copyto(depth, np.nan, where=~((depth >= sensor.depth_min) & (depth <= sensor.depth_max)))
     return Measurements(
         xy=np.array(features.xy[rows], dtype=np.float64),
         depth=depth,
-        sigma_px=noise_model.pixel_sigma(features.octave[rows], pixel_noise=sensor.pixel_noise, octave_scale=float(features.octave_scale)),
+        sigma_px=_sigma_of_octave(sensor.pixel_noise, float(features.octave_scale)).take(features.octave[rows]),
         sigma_z=noise_model.depth_sigma(depth, base=sensor.depth_noise_base, quadratic=sensor.depth_noise_quadratic),
     )
+
+
+@lru_cache(maxsize=4)
+def _sigma_of_octave(pixel_noise: float, octave_scale: float) -> np.ndarray:
+    """Tabulate the standard deviation [px] of key points by their octave, for every value that it can be stored as."""
+    with np.errstate(over="ignore"):
+        return noise_model.pixel_sigma(np.arange(256), pixel_noise=pixel_noise, octave_scale=octave_scale)
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,7 @@ class MapBuilder:
         self.features = features
         self.desc = np.ascontiguousarray(features.desc).view(np.uint64)
         self.octave = np.ascontiguousarray(features.octave)
+        self._offset = np.array(features.offset, dtype=np.int64)
         self.octave_scale = float(features.octave_scale)
         self.kf = Table(frame=("i4",), segment=("i4",), T_wk=("f8", 4, 4))
         self.lm = Table(
@@ -109,11 +110,9 @@ class MapBuilder:
 
     def landmarks_in(self, kfs: np.ndarray) -> np.ndarray:
         """Give the landmarks (N,) that any of the key frames sees, increasing."""
-        seen = np.zeros(len(self.lm), dtype=np.bool_)
-        for kf in kfs:
-            ids = self.lm_of_row[self.rows_of(kf)]
-            seen[ids[ids >= 0]] = True
-        return np.flatnonzero(seen).astype(np.int32)
+        is_seen, frame = np.zeros(len(self.lm), dtype=np.bool_), self.kf.frame[kfs]
+        _mark(self._offset[frame], self._offset[frame + 1], self.lm_of_row, is_seen)
+        return np.flatnonzero(is_seen).astype(np.int32)
 
     def landmarks_of(self, kf: int) -> np.ndarray:
         """Give the landmarks (N,) of one key frame in the order of its features."""
@@ -129,7 +128,7 @@ class MapBuilder:
 
     def candidates(self, ids: np.ndarray) -> Candidates:
         """Give landmarks in the form that guided matching takes."""
-        return Candidates(xyz=self.lm.xyz[ids], desc=self.lm.desc[ids], direction=self.lm.direction[ids], reach=self.lm.reach[ids])
+        return Candidates(*(column.take(ids, axis=0) for column in (self.lm.xyz, self.lm.desc, self.lm.direction, self.lm.reach)))
 
     def observations_of(self, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Give all observations of landmarks `ids`: index into `ids`, key frame, feature row; sorted by (landmark, key frame)."""
@@ -137,8 +136,7 @@ class MapBuilder:
         which, kf, row = np.empty(total, np.int32), np.empty(total, np.int32), np.empty(total, np.int64)
         n = _gather(ids, self.lm.head, self.obs.next, self.obs.kf, self.obs.row, which, kf, row)
         assert n == total
-        order = np.lexsort((kf, which))
-        return which[order], kf[order], row[order]
+        return which, kf, row
 
     def remove_observations(self, rows: np.ndarray) -> None:
         """Forget that the features `rows` (N,) of key frames show their landmarks; a landmark without views dies."""
@@ -150,13 +148,14 @@ class MapBuilder:
         self.remove_observations(rows)
         self.lm.is_alive[ids] = False
 
-    def fuse(self, kept: int, gone: int) -> None:
-        """Merge landmark `gone` into `kept`: its views move over, save where a key frame sees `kept` already."""
-        _fuse(kept, gone, self.lm_of_row, self.lm.head, self.lm.n_obs, self.obs.next, self.obs.lm, self.obs.kf, self.obs.row)
-        self.lm.n_visible[kept] += self.lm.n_visible[gone]
-        self.lm.n_found[kept] += self.lm.n_found[gone]
-        self.lm.is_alive[gone] = False
-        self.lm.replaced_by[gone] = kept
+    def fuse(self, kept: np.ndarray, gone: np.ndarray) -> None:
+        """Merge landmarks `gone` (N,) into `kept` (N,), in this order: their views move over, save where a key frame sees the other already.
+
+        A pair one of which is dead, or died by a fusion before it, is passed over.
+        """
+        columns = (self.lm.head, self.lm.n_obs, self.lm.n_visible, self.lm.n_found, self.lm.is_alive, self.lm.replaced_by)
+        pairs = (np.ascontiguousarray(ids, dtype=np.int32) for ids in (kept, gone))
+        _fuse(*pairs, self.lm_of_row, *columns, self.obs.next, self.obs.lm, self.obs.kf, self.obs.row)
 
     def refresh(self, ids: np.ndarray) -> None:
         """Recompute what guided matching needs of landmarks `ids`: descriptor, viewing direction, reach."""
@@ -241,6 +240,15 @@ def _link(head: i4[::1], n_obs: i4[::1], next_: i4[::1], obs_lm: i4[::1], start:
 
 
 @kernel
+def _mark(first: i8[::1], last: i8[::1], lm_of_row: i4[::1], is_seen: b1[::1]):
+    """Mark the landmarks that rows `first` to `last` of the features, the last left out, show in each of several key frames."""
+    for k in range(len(first)):
+        for row in range(first[k], last[k]):
+            if lm_of_row[row] >= 0:
+                is_seen[lm_of_row[row]] = True
+
+
+@kernel
 def _count_views(ids: i4[::1], head: i4[::1], next_: i4[::1], obs_kf: i4[::1], counts: i4[::1]):
     for lm in ids:
         o = head[lm]
@@ -252,12 +260,17 @@ def _count_views(ids: i4[::1], head: i4[::1], next_: i4[::1], obs_kf: i4[::1], c
 
 @kernel
 def _gather(ids: i4[::1], head: i4[::1], next_: i4[::1], obs_kf: i4[::1], obs_row: i8[::1], which: i4[::1], kf: i4[::1], row: i8[::1]):
+    """Write the observations of landmarks `ids`, each one's sorted by key frame as they come: most chains nearly are. Returns how many."""
     n = 0
     for i in range(len(ids)):
-        o = head[ids[i]]
+        first, o = n, head[ids[i]]
         while o >= 0:
             if obs_kf[o] >= 0:
-                which[n], kf[n], row[n] = i, obs_kf[o], obs_row[o]
+                place = n
+                while place > first and kf[place - 1] > obs_kf[o]:
+                    kf[place], row[place] = kf[place - 1], row[place - 1]
+                    place -= 1
+                which[n], kf[place], row[place] = i, obs_kf[o], obs_row[o]
                 n += 1
             o = next_[o]
     return n
@@ -285,39 +298,48 @@ def _unlink(
 
 @kernel
 def _fuse(
-    kept: i8,
-    gone: i8,
+    kept: i4[::1],
+    gone: i4[::1],
     lm_of_row: i4[::1],
     head: i4[::1],
     n_obs: i4[::1],
+    n_visible: i4[::1],
+    n_found: i4[::1],
+    is_alive: b1[::1],
+    replaced_by: i4[::1],
     next_: i4[::1],
     obs_lm: i4[::1],
     obs_kf: i4[::1],
     obs_row: i8[::1],
 ):
-    o = head[gone]
-    while o >= 0:
-        following = next_[o]
-        if obs_kf[o] >= 0:
-            clash = False
-            p = head[kept]
-            while p >= 0:
-                if obs_kf[p] == obs_kf[o]:
-                    clash = True
-                    break
-                p = next_[p]
-            if clash:
-                lm_of_row[obs_row[o]] = -1
-                obs_kf[o] = -1
-            else:
-                lm_of_row[obs_row[o]] = kept
-                obs_lm[o] = kept
-                next_[o] = head[kept]
-                head[kept] = o
-                n_obs[kept] += 1
-        o = following
-    head[gone] = -1
-    n_obs[gone] = 0
+    for pair in range(len(kept)):
+        a, b = kept[pair], gone[pair]
+        if not (is_alive[a] and is_alive[b]):
+            continue
+        o = head[b]
+        while o >= 0:
+            following = next_[o]
+            if obs_kf[o] >= 0:
+                clash = False
+                p = head[a]
+                while p >= 0:
+                    if obs_kf[p] == obs_kf[o]:
+                        clash = True
+                        break
+                    p = next_[p]
+                if clash:
+                    lm_of_row[obs_row[o]] = -1
+                    obs_kf[o] = -1
+                else:
+                    lm_of_row[obs_row[o]] = a
+                    obs_lm[o] = a
+                    next_[o] = head[a]
+                    head[a] = o
+                    n_obs[a] += 1
+            o = following
+        n_visible[a] += n_visible[b]
+        n_found[a] += n_found[b]
+        head[b], n_obs[b], is_alive[b], replaced_by[b] = -1, 0, False, a
 
 
 @kernel

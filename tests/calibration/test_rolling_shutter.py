@@ -109,18 +109,30 @@ def test_the_motion_is_that_of_a_cubic_and_of_a_line_where_a_frame_is_missing():
     np.testing.assert_array_equal(rolling_shutter.twists(stamp[:1], path[:1]), np.zeros((1, 6)))
 
 
-def test_features_are_rectified_the_same_in_small_portions(monkeypatch):
+@pytest.mark.parametrize("delay", [0.01, np.nan])
+def test_features_are_rectified_by_what_flow_says_of_them(delay):
     rng = np.random.default_rng(0)
     scene = observe(sweep(6), room_points(2000, rng), rng)
-    when = rolling_shutter.Timing(
-        readout=np.array(0.02), depth_readout=np.array(0.03), depth_delay=np.array(0.01), twist=rng.normal(0, 0.5, (6, 6))
+    given = replace(
+        scene.features,
+        slope=rng.normal(0, 1e-3, scene.features.slope.shape).astype(np.float32),
+        depth=np.where(rng.random(len(scene.features.depth)) < 0.2, np.float32(np.nan), scene.features.depth),
     )
-    whole = rolling_shutter.rectify(scene.features, when, CAMERA)
-    assert np.abs(whole.xy - scene.features.xy).max() > 1.0 and np.nanmax(np.abs(whole.depth - scene.features.depth)) > 0.005
-    monkeypatch.setattr(rolling_shutter, "ROWS_AT_ONCE", 100)
-    again = rolling_shutter.rectify(scene.features, when, CAMERA)
-    np.testing.assert_array_equal(again.xy, whole.xy)
-    np.testing.assert_array_equal(again.depth, whole.depth)
+    when = Timing(readout=np.array(0.02), depth_readout=np.array(0.03), depth_delay=np.array(delay), twist=rng.normal(0, 0.5, (6, 6)))
+    found = rolling_shutter.rectify(given, when, CAMERA)
+    rows = np.arange(len(given.xy))
+    moving = rolling_shutter.flow(given, when.twist, CAMERA, rows)
+    later = moving.share * 0.02
+    expected = (given.xy - moving.px_per_s * later[:, None]).astype(np.float32)
+    assert np.abs(expected - given.xy).max() > 1.0
+    np.testing.assert_array_equal(found.xy, expected)
+    if np.isnan(delay):
+        np.testing.assert_array_equal(found.depth, given.depth)
+        return
+    lag = rolling_shutter.depth_lag(given, when)[np.searchsorted(given.offset, rows, side="right") - 1]
+    z = given.depth - moving.reading_per_s * (lag + moving.share * 0.03) - moving.slant_per_s * later
+    assert np.nanmax(np.abs(z - given.depth)) > 0.005
+    np.testing.assert_array_equal(found.depth, np.where(z > 0, z, np.nan).astype(np.float32))
 
 
 def test_depth_is_moved_to_where_colour_was_taken():

@@ -94,3 +94,11 @@ def test_the_processes_really_compile_and_leave_their_kernels_in_the_folder(monk
     names = list(compilation.compile_all(1))
     assert names
     assert len(list(tmp_path.rglob("*.nbc"))) >= len(names)
+
+
+def test_a_process_compiles_its_share_and_names_it() -> None:
+    home = Path(compilation.__file__).parents[2]
+    command = [sys.executable, "-c", compilation.CHILD, "0", str(len(compilation.declared()))]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, cwd=home)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split() == [compilation.declared()[0].py_func.__qualname__]

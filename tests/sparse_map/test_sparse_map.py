@@ -6,7 +6,7 @@ from scenes import CAMERA, observe, room_points, sweep
 
 from slamcli.config.options import SensorConfig
 from slamcli.geometry import se3
-from slamcli.sparse_map import map_adjustment
+from slamcli.sparse_map import guided_matching, map_adjustment
 from slamcli.sparse_map.sparse_map import MapBuilder
 
 
@@ -47,6 +47,7 @@ def twin_observations(builder: MapBuilder) -> set:
 def chained_observations(builder: MapBuilder) -> set:
     ids = np.arange(len(builder.lm), dtype=np.int32)
     which, kf, row = builder.observations_of(ids)
+    assert (np.diff(which) >= 0).all() and (np.diff(kf)[np.diff(which) == 0] > 0).all()
     return set(zip(which.tolist(), kf.tolist(), row.tolist(), strict=True))
 
 
@@ -58,8 +59,7 @@ def test_both_tables_tell_the_same_after_any_edit(scene):
     builder.remove_observations(rng.choice(occupied, 200, replace=False))
     assert chained_observations(builder) == twin_observations(builder)
     alive = np.flatnonzero(builder.lm.is_alive)
-    for kept, gone in rng.permutation(alive)[:100].reshape(-1, 2):
-        builder.fuse(int(kept), int(gone))
+    builder.fuse(*rng.permutation(alive)[:100].reshape(2, -1))
     builder.remove_landmarks(np.flatnonzero(builder.lm.is_alive)[:50].astype(np.int32))
     assert chained_observations(builder) == twin_observations(builder)
     counts = np.bincount([lm for lm, _, _ in twin_observations(builder)], minlength=len(builder.lm))
@@ -79,8 +79,7 @@ def test_votes_and_landmarks_agree_with_sets(scene):
 
 def test_fused_landmarks_resolve_along_the_chain(scene):
     builder = build(scene)
-    builder.fuse(1, 2)
-    builder.fuse(0, 1)
+    builder.fuse(np.array([1, 0, 3]), np.array([2, 1, 2]))  # the last pair comes too late: 2 is dead by then
     builder.remove_landmarks(np.array([5], np.int32))
     np.testing.assert_array_equal(builder.resolve(np.array([2, 1, 0, -1, 5])), [0, 0, 0, -1, -1])
 
@@ -132,3 +131,15 @@ def test_carried_landmarks_keep_their_place_in_the_camera(scene):
     builder.kf.T_wk[2] = before[2] @ se3.exp(np.array([0.1, 0.2, -0.1, 0.3, 0.1, 0.0]))
     map_adjustment.carry(builder, ids, kfs, before)
     np.testing.assert_allclose(se3.transform(se3.inverse(builder.kf.T_wk[2]), builder.lm.xyz[ids]), x_c, atol=1e-12)
+
+
+def test_buckets_hold_each_feature_once_and_in_order():
+    rng = np.random.default_rng(4)
+    xy = rng.uniform(-30.0, [CAMERA.width + 30.0, CAMERA.height + 30.0], (500, 2)).astype(np.float32)
+    xy[:3] = [[0.0, 0.0], [20.0, 20.0], [19.999999, 40.0]]
+    start, order = guided_matching.sort_into_buckets(xy, CAMERA)
+    columns, rows = -(-CAMERA.width // guided_matching.CELL), -(-CAMERA.height // guided_matching.CELL)
+    cell = np.clip((xy.astype(np.float64) // guided_matching.CELL).astype(int), 0, [columns - 1, rows - 1])
+    bucket = cell[:, 1] * columns + cell[:, 0]
+    np.testing.assert_array_equal(order, np.argsort(bucket, kind="stable"))
+    np.testing.assert_array_equal(start, np.searchsorted(np.sort(bucket), np.arange(columns * rows + 1)))
