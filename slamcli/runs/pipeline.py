@@ -168,6 +168,7 @@ class Pipeline:
         first_forced = NAMES.index(start) if start else 0 if force else len(NAMES)
         if start and last < first_forced:
             raise SlamError(f"--from {start} --until {until}: {until} comes before {start}")
+        self._tell(f"{self.run.info()['dataset']} -> {self.run.path}")
         for index, stage in enumerate(STAGES[: last + 1]):
             state = self.states()[stage.name]
             if state.is_fresh and index < first_forced:
