@@ -23,6 +23,7 @@ THICKNESS = 0.03  # [m] two points of one surface lie within this, three sigma o
 FARTHEST_TWIN = 0.6  # [m] from a surface to its double; what is farther apart is two things
 LEAST_TWIN = 0.02  # share of a view's pixels in which another shows a surface standing in free space
 FLAT = 0.04  # [m] points of a flat wall lie within this of a plane, twice the noise added
+PATH_SQUARE = 0.5  # [m] about a robot's width
 UPRIGHT = 0.5  # cosine of a wall's normal to the vertical at most
 
 
@@ -50,6 +51,7 @@ class Evidence:
     """The figures a verdict rests on."""
 
     free_area: float  # [m^2] of free cells
+    path_area: float  # [m^2] of the squares of PATH_SQUARE that the camera crossed: what a robot that drove there has under it
     path_known: float  # share of the frames whose camera stands over a cell that is free or occupied
     is_floor_found: bool
     views: int  # looked at
@@ -73,6 +75,7 @@ def measure(grid: Grid, T_lc: np.ndarray, views: Sequence[View], *, is_floor_fou
     twins = [twin for twin in (twin_distance(view, views) for view in views) if np.isfinite(twin)]
     return Evidence(
         free_area=float((grid.state == 0).sum() * grid.resolution**2),
+        path_area=len(np.unique(np.floor(T_lc[:, :2, 3] / PATH_SQUARE), axis=0)) * PATH_SQUARE**2,
         path_known=known_share(grid, T_lc[:, :3, 3]),
         is_floor_found=is_floor_found,
         views=len(views),

@@ -1,7 +1,7 @@
 """Whether a robot could use a run's map, why not, and what to do about it at the next recording."""
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -13,9 +13,9 @@ from slamcli.runs.run_directory import RunDir
 from slamcli.schema import CoarseDepth, Grid, Ground, Map, Tracks, frame_poses
 from slamcli.stages.densify import depth_poses
 
-# A map below one of the first two is of no use to a robot; the others tell why.
+# A map with less free floor than this, or than the camera's path covers, or with fewer such views is of no use; the others tell why.
 LEAST_FREE = 2.0  # [m^2] of free floor: a robot of 0.2 m radius can hardly turn round on less
-LEAST_FLOOR = 0.25  # share of the views that saw the floor
+LEAST_FLOOR = 0.4  # share of the views that saw the floor
 LEAST_PATH = 0.25  # share of the camera's path over known cells; drives have 0.8 and more, a hand that circles something has 0
 MOST_DOUBLED = 0.04  # share of the views in whose free space another view puts what they see; sound recordings have 0
 MOST_MISSING = 0.4  # share of the depth images' pixels; sound recordings have 0.04 to 0.31
@@ -74,8 +74,12 @@ def judge(evidence: Evidence, *, max_range: float) -> Verdict:
 
     max_range : [m] to which the grid uses depth
     """
-    is_poor = evidence.free_area < LEAST_FREE or evidence.views_with_floor < LEAST_FLOOR * evidence.views or not evidence.is_floor_found
-    why = [*_wall(evidence), *_holes(evidence), *_floor(evidence, max_range)] or [_small(evidence)] if is_poor else _path(evidence)
+    is_small = evidence.free_area < max(LEAST_FREE, evidence.path_area)
+    is_poor = is_small or evidence.views_with_floor < LEAST_FLOOR * evidence.views or not evidence.is_floor_found
+    if is_poor:
+        why = [*_wall(evidence), *_holes(evidence), *_floor(evidence, max_range)] or [_small(evidence)]
+    else:
+        why = [replace(finding, is_grave=False) for finding in (*_holes(evidence), *_path(evidence))]
     return Verdict(evidence, (*_doubled(evidence), *why))
 
 
@@ -117,14 +121,15 @@ def _too_high(e: Evidence, seen: str, max_range: float) -> Finding:
 
 
 def _small(e: Evidence) -> Finding:
-    return Finding(SMALL, f"only {e.free_area:.1f} m2 of free floor", "walk through the room with the floor ahead in view")
+    message = f"only {e.free_area:.1f} m2 of free floor, and the camera passed over {e.path_area:.1f} m2"
+    return Finding(SMALL, message, "walk through the room with the floor ahead in view")
 
 
 def _path(e: Evidence) -> list[Finding]:
     if e.path_known >= LEAST_PATH:
         return []
     message = f"{1 - e.path_known:.0%} of the camera's path lie in space never seen, so no path can be planned from its start"
-    return [Finding(OFF_PATH, message, "look at the floor before you walk over it", is_grave=False)]
+    return [Finding(OFF_PATH, message, "look at the floor before you walk over it")]
 
 
 def of_run(run: RunDir) -> Verdict | None:

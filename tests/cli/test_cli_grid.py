@@ -94,6 +94,21 @@ def test_plan_draws_into_the_run_by_default(run, here, slamcli):
     assert (run / "plan.png").stat().st_size > 1000
 
 
+def test_plan_between_where_the_camera_began_and_ended(run, here, slamcli):
+    result = slamcli("plan", "--start", "first", "--goal", "last", "-r", run, "--png", "p.png", "--json")
+    assert result.exit_code == 0, result.stderr
+    about = json.loads(result.stdout)
+    assert about["start"] == pytest.approx(about["points"][0], abs=1e-3)
+    assert about["length"] > 0.0
+
+
+def test_a_map_file_does_not_tell_where_the_camera_was(run, here, slamcli):
+    slamcli("export-grid", "map.pgm", "-r", run)
+    result = slamcli("plan", "--map", "map.yaml", "--start", "first", "--goal", "1,1")
+    assert result.exit_code == 1
+    assert "does not tell where a camera was" in result.stderr
+
+
 def test_plan_on_a_map_of_someone_else(run, here, slamcli):
     slamcli("export-grid", "map.pgm", "-r", run)
     result = slamcli("plan", "--map", "map.yaml", "--start", "0,0.5", "--goal", "2.5,0.5")
