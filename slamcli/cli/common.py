@@ -1,5 +1,6 @@
 """Options that several commands share."""
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
@@ -14,6 +15,29 @@ set_option = click.option(
     "-s", "--set", "assignments", multiple=True, metavar="KEY=VALUE", help="Set an option, such as -s track.min_inliers=20."
 )
 config_option = click.option("--config", "config_name", metavar="NAME|FILE", help="Start from fast, accurate, default or a TOML file.")
+
+
+class Mount(click.ParamType):
+    """A camera's place on a robot, as six numbers of a URDF's origin."""
+
+    name = "x,y,z,roll,pitch,yaw"
+
+    def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> tuple[float, ...]:
+        """Read six finite numbers."""
+        try:
+            numbers = tuple(float(part) for part in str(value).split(","))
+        except ValueError:
+            numbers = ()
+        if len(numbers) != 6 or not all(math.isfinite(number) for number in numbers):
+            self.fail(f"{value!r} is not x,y,z,roll,pitch,yaw such as 0.1,0,0.3,0,0.2,0", param, ctx)
+        return numbers
+
+
+mount_option = click.option(
+    "--mount",
+    type=Mount(),
+    help="Where the camera's body is on the robot's base [m, rad], as a URDF origin: tell the base's poses instead.",
+)
 
 
 def _voice(context: click.Context, parameter: click.Parameter, value: int) -> int:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from slamcli.cli.common import json_option, run_option
+from slamcli.cli.common import json_option, mount_option, run_option
 
 if TYPE_CHECKING:
     import numpy as np
@@ -40,11 +40,16 @@ class Place(click.ParamType):
 @click.option(
     "--png", type=click.Path(path_type=Path, dir_okay=False), help="Also draw a picture with the trajectory, a scale bar and a legend."
 )
-def export_grid(out: Path, run: str | None, png: Path | None) -> None:
+@mount_option
+@json_option
+def export_grid(out: Path, run: str | None, png: Path | None, mount: tuple[float, ...] | None, as_json: bool) -> None:
     """Write the navigation grid OUT (.pgm) and its page (.yaml) beside it, for map_server and nav2.
+
+    The page's first line tells where the recording began: a robot's initial pose there, with --mount that of its base.
 
     \b
       slamcli export-grid map.pgm --png map.png
+      slamcli export-grid map.pgm --mount 0.1,0,0.3,0,0.2,0
     """
     from slamcli.formats import grid_map
     from slamcli.runs.run_directory import RunDir
@@ -53,14 +58,32 @@ def export_grid(out: Path, run: str | None, png: Path | None) -> None:
     folder = RunDir.find(run)
     grid = folder.load(Grid, "grid2d")
     warn_without_floor(folder)
-    written: tuple[Path, ...] = grid_map.write(out, grid_map.GridMap(grid.state, tuple(grid.origin.tolist()), float(grid.resolution)))
+    start = _start(folder, mount)
+    written: tuple[Path, ...] = grid_map.write(
+        out, grid_map.GridMap(grid.state, tuple(grid.origin.tolist()), float(grid.resolution)), start=start
+    )
     if png is not None:
         from slamcli.visualization.grid_picture import save_picture
 
         save_picture(png, grid, trajectory=camera_path(folder), title=str(folder.info()["dataset"]))
         written = (*written, png)
     rows, columns = grid.state.shape
+    if as_json:
+        about = {"out": [str(path) for path in written], "columns": columns, "rows": rows, "resolution": float(grid.resolution)}
+        click.echo(json.dumps(about | {"origin": grid.origin.tolist(), "start": dict(zip(("x", "y", "yaw"), start, strict=True))}))
+        return
     click.echo(f"{', '.join(str(path) for path in written)}: {columns} x {rows} cells of {float(grid.resolution):g} m", err=True)
+
+
+def _start(folder: RunDir, mount: tuple[float, ...] | None) -> tuple[float, float, float]:
+    """Return x, y, yaw in the level frame of the first frame's camera or, where it is mounted on one, of the robot's base."""
+    from slamcli.navigation.robot_pose import base_in_camera, base_pose
+    from slamcli.runs import placement
+    from slamcli.schema import Ground
+
+    if mount is None:
+        return placement.read(folder).first
+    return base_pose(folder.load(Ground, "densify").T_lw @ placement.camera_poses(folder)[0], base_in_camera(mount))
 
 
 @click.command()

@@ -15,6 +15,7 @@ import numpy as np
 
 from slamcli.datasets.tum import MAX_DIFFERENCE, associate
 from slamcli.errors import SlamError
+from slamcli.formats.trajectory import read_tum
 from slamcli.geometry import se3
 from slamcli.schema import Features, Map, Tracks, Trajectory, trajectory
 
@@ -113,8 +114,16 @@ def last_stage(run: Any) -> str:
 
 
 def stage_trajectory(run: Any, stage: str) -> Trajectory:
-    """Give the poses of all frames that have one after a stage."""
+    """Return the poses of all frames that have one after a stage; from its file, to the nanometre, where extract was cleared away."""
+    if run.record("extract") is None:
+        return read_tum(run.stage_path(stage, "trajectory.txt"))
     return trajectory(run.load(Features, "extract").stamp, run.load(Tracks, stage), run.load(Map, stage))
+
+
+def frame_count(run: Any) -> int:
+    """Count the colour frames of a run's recording, as any of its stages knows them."""
+    records = (run.record(stage) for stage in ("extract", *reversed(STAGES)))
+    return next(int(record["summary"]["frames"]) for record in records if record is not None)
 
 
 def ground_truth(run: Any) -> Trajectory:

@@ -55,9 +55,11 @@ class RunDir:
 
     @classmethod
     def find(cls, run: str | None) -> "RunDir":
-        """Open the run a command means: `run` (of -r), else $SLAMCLI_RUN, else the one last touched by `slamcli run`."""
+        """Open the run a command means: `run` (of -r), a folder or a name under runs/, else $SLAMCLI_RUN, else the one last touched."""
         named = run or os.environ.get("SLAMCLI_RUN")
         path = Path(named) if named else LATEST
+        if named and not (path / "run.json").is_file() and (RUNS / named / "run.json").is_file():
+            path = RUNS / named
         if (path / "run.json").is_file():
             return cls(path if named else Path(os.path.relpath(path.resolve())))._checked()
         if named:
