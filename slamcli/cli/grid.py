@@ -51,6 +51,8 @@ def export_grid(out: Path, run: str | None, png: Path | None, mount: tuple[float
       slamcli export-grid map.pgm --png map.png
       slamcli export-grid map.pgm --mount 0.1,0,0.3,0,0.2,0
     """
+    import numpy as np
+
     from slamcli.formats import grid_map
     from slamcli.runs.run_directory import RunDir
     from slamcli.schema import Grid
@@ -59,9 +61,7 @@ def export_grid(out: Path, run: str | None, png: Path | None, mount: tuple[float
     grid = folder.load(Grid, "grid2d")
     warn_without_floor(folder)
     start = _start(folder, mount)
-    written: tuple[Path, ...] = grid_map.write(
-        out, grid_map.GridMap(grid.state, tuple(grid.origin.tolist()), float(grid.resolution)), start=start
-    )
+    written: tuple[Path, ...] = grid_map.write(out, grid_map.GridMap.of(grid), start=start)
     if png is not None:
         from slamcli.visualization.grid_picture import save_picture
 
@@ -70,7 +70,9 @@ def export_grid(out: Path, run: str | None, png: Path | None, mount: tuple[float
     rows, columns = grid.state.shape
     if as_json:
         about = {"out": [str(path) for path in written], "columns": columns, "rows": rows, "resolution": float(grid.resolution)}
-        click.echo(json.dumps(about | {"origin": grid.origin.tolist(), "start": dict(zip(("x", "y", "yaw"), start, strict=True))}))
+        click.echo(
+            json.dumps(about | {"origin": np.round(grid.origin, 9).tolist(), "start": dict(zip(("x", "y", "yaw"), start, strict=True))})
+        )
         return
     click.echo(f"{', '.join(str(path) for path in written)}: {columns} x {rows} cells of {float(grid.resolution):g} m", err=True)
 

@@ -25,6 +25,7 @@ class Content:
     """A run as the page shows it. `F` frames; poses in the level frame, z up."""
 
     name: str
+    flag: str  # -r and the run's folder, for hints
     stage: str  # whose trajectory is shown
     stamp: np.ndarray  # (F,) [s]
     T_lc: np.ndarray  # (F, 4, 4), NaN = lost
@@ -73,6 +74,7 @@ def collect(run: RunDir) -> Content:
     recording, doubts = _recording(run)
     return Content(
         name=str(run.info()["dataset"]),
+        flag=run.flag,
         stage=stage,
         stamp=np.array(features.stamp),
         T_lc=T_lc,

@@ -110,7 +110,7 @@ def last_stage(run: Any) -> str:
     for stage in reversed(STAGES):
         if run.record(stage) is not None:
             return stage
-    raise SlamError(f"{run.path}: no stage has made a trajectory yet; try: slamcli run --until track")
+    raise SlamError(f"{run.path}: no stage has made a trajectory yet; try: slamcli run --until track {run.flag}")
 
 
 def stage_trajectory(run: Any, stage: str) -> Trajectory:
@@ -133,7 +133,7 @@ def ground_truth(run: Any) -> Trajectory:
     if truth is None:
         raise SlamError(
             f"{dataset.root}: no ground truth, so there is nothing to compare with; "
-            "put a groundtruth.txt (timestamp tx ty tz qx qy qz qw) there, or look at the result with: slamcli report"
+            f"put a groundtruth.txt (timestamp tx ty tz qx qy qz qw) there, give one with --truth, or look at the result with: slamcli report {run.flag}"
         )
     return truth
 

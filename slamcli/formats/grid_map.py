@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from slamcli.errors import SlamError
+from slamcli.schema import Grid
 
 OCCUPIED, FREE, UNKNOWN = 1, 0, -1
 GREY = {OCCUPIED: 0, FREE: 254, UNKNOWN: 205}
@@ -29,6 +30,12 @@ class GridMap:
     state: np.ndarray  # (H, W) int8: 1 occupied, 0 free, -1 unknown; row 0 is the smallest y
     origin: tuple[float, float]  # m, outer corner of cell (0, 0)
     resolution: float  # m, side of a cell
+
+    @classmethod
+    def of(cls, grid: Grid) -> "GridMap":
+        """Take a run's grid, its numbers without the tails that sums of cells leave (-1.1500000000000001)."""
+        x, y = (round(float(value), 9) + 0.0 for value in grid.origin)
+        return cls(grid.state, (x, y), round(float(grid.resolution), 9))
 
 
 def write(path: Path, grid: GridMap, *, start: tuple[float, float, float] | None = None) -> tuple[Path, Path]:

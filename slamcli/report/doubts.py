@@ -124,9 +124,9 @@ def _stages(content: Content) -> list[Remark]:
     found = []
     for stage, state in content.states.items():
         if state.state == MISSING:
-            found.append(Remark(NOTE, f"{stage} has not been run; go on with: slamcli run"))
+            found.append(Remark(NOTE, f"{stage} has not been run; go on with: slamcli run {content.flag}"))
         elif not state.is_fresh:
-            found.append(Remark(BAD, f"{stage} is {state.state} ({state.reason}); bring it up to date with: slamcli run"))
+            found.append(Remark(BAD, f"{stage} is {state.state} ({state.reason}); bring it up to date with: slamcli run {content.flag}"))
         warnings = [
             text
             for text in state.record.get("warnings", [])

@@ -31,7 +31,8 @@ def render(content: Content, pictures: list[Picture], inspected: Sequence[tuple[
         "cards": _cards(content),
         "remarks": _remarks(doubts.remarks(content, inspected)),
         "errors": _errors(content),
-        "maps": "".join(_picture(picture) for picture in pictures) or "<p>No map has been made yet; go on with: slamcli run</p>",
+        "maps": "".join(_picture(picture) for picture in pictures)
+        or f"<p>No map has been made yet; go on with: slamcli run {html.escape(content.flag)}</p>",
         "timings": _timings(content),
         "recording": _pairs({"folder": content.recording["root"], **content.recording["camera"]}),
         "configuration": _configuration(content),

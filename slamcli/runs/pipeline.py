@@ -184,11 +184,19 @@ class Pipeline:
         stage, states = stage_named(name), self.states()
         for need in (states[n] for n in stage.needs if n != "dataset"):
             if need.state == staleness.MISSING:
-                raise SlamError(f"{name} needs {need.stage}, which has not been run; try: slamcli run --until {need.stage}")
+                raise SlamError(f"{name} needs {need.stage}, which has not been run; try: slamcli run --until {need.stage} {self.run.flag}")
             if need.state == staleness.DAMAGED:
-                raise SlamError(f"{name} needs {need.stage}, which is damaged ({need.reason}); try: slamcli run --until {need.stage}")
+                raise SlamError(
+                    f"{name} needs {need.stage}, which is damaged ({need.reason}); try: slamcli run --until {need.stage} {self.run.flag}"
+                )
             if not need.is_fresh:
-                log.warning("%s rests on %s, which is stale (%s); slamcli run would bring it up to date", name, need.stage, need.reason)
+                log.warning(
+                    "%s rests on %s, which is stale (%s); bring it up to date with: slamcli run %s",
+                    name,
+                    need.stage,
+                    need.reason,
+                    self.run.flag,
+                )
         self.run_stage(stage)
 
     def run_stage(self, stage: Stage) -> None:

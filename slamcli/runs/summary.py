@@ -1,6 +1,5 @@
 """What a finished run made, in a few lines, and what can be done with it."""
 
-import shlex
 from pathlib import Path
 from typing import Any
 
@@ -57,7 +56,7 @@ def _cost(records: dict[str, Any]) -> list[str]:
 def next_commands(run: RunDir) -> list[str]:
     """List the commands that come next for this run, each to be pasted as it is."""
     has_truth = (Path(run.info()["root"]) / "groundtruth.txt").is_file()
-    which = f"-r {shlex.quote(str(run.path))}"
+    which = run.flag
     return [
         *([f"slamcli eval ape {which}"] if has_truth else []),
         f"slamcli report {which}",

@@ -38,9 +38,7 @@ def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
     save(made, out)
     has_pose = np.isfinite(T_lc[:, 0, 0])
     start = planar_pose(T_lc[has_pose][0]) if has_pose.any() else None
-    grid_map.write(
-        out / "map.pgm", grid_map.GridMap(made.state, (float(made.origin[0]), float(made.origin[1])), float(made.resolution)), start=start
-    )
+    grid_map.write(out / "map.pgm", grid_map.GridMap.of(made), start=start)
     rows, columns = made.state.shape
     return {**summary, "columns": columns, "rows": rows, **counts, "floor": bool(ground.is_found)}
 

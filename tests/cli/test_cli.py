@@ -250,7 +250,7 @@ def test_a_stage_command_names_what_is_missing(fake: Path, slamcli: Slamcli) -> 
     slamcli("run", "recordings/desk", "--until", "match")
     result = slamcli("loop")
     assert result.exit_code == 1
-    assert result.stderr == "Error: loop needs optimize, which has not been run; try: slamcli run --until optimize\n"
+    assert result.stderr == "Error: loop needs optimize, which has not been run; try: slamcli run --until optimize -r runs/desk\n"
 
 
 # status
