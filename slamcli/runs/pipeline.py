@@ -213,7 +213,9 @@ class Pipeline:
                     module = importlib.import_module(f"slamcli.stages.{stage.name}")
                     meter.watch_compiler(self._tell)
                     summary = module.run(Inputs(stage, self.run, self.dataset), out, Settings(stage, self.config), tools)
-            except KeyboardInterrupt:
+            except (KeyboardInterrupt, SystemError) as error:
+                if not _is_interrupt(error):
+                    raise
                 raise KeyboardInterrupt(f"interrupted in {stage.name}; earlier stages are kept") from None
             record = self._record(stage, inputs, run_directory.outputs(out), meter, tools, summary)
             self.run.commit(stage.name, out, record)
@@ -261,6 +263,13 @@ class Pipeline:
             "warnings": tools.warnings,
             "n_warnings": tools.n_warnings,
         }
+
+
+def _is_interrupt(error: BaseException | None) -> bool:
+    """Tell whether an error began as Ctrl-C: one that comes while a kernel is looked up reaches us as numba's SystemError."""
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__cause__ or error.__context__
+    return error is not None
 
 
 def _plain(value: Any) -> Any:

@@ -193,6 +193,18 @@ def test_what_ends_a_stage_early_is_told_in_a_line_and_keeps_what_was_done(
     assert states(slamcli) == {"extract": "up to date", **dict.fromkeys(NAMES[1:], "missing")}
 
 
+def test_ctrl_c_that_numba_turned_into_another_error_is_still_ctrl_c(fake: Path, slamcli: Slamcli, monkeypatch: pytest.MonkeyPatch) -> None:
+    error = SystemError("CPUDispatcher returned a result with an exception set")
+    error.__cause__ = KeyboardInterrupt()
+    fail_with(error, monkeypatch)
+    result = slamcli("run", "recordings/desk")
+    assert result.exit_code == 130
+    assert result.stderr.splitlines()[-1] == "Error: interrupted in match; earlier stages are kept"
+    fail_with(SystemError("a bug of its own"), monkeypatch)
+    with pytest.raises(SystemError):
+        slamcli("run", "recordings/desk")
+
+
 def test_a_bug_keeps_its_traceback(fake: Path, slamcli: Slamcli, monkeypatch: pytest.MonkeyPatch) -> None:
     fail_with(ZeroDivisionError("a bug"), monkeypatch)
     with pytest.raises(ZeroDivisionError):
