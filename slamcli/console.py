@@ -4,6 +4,7 @@ The library takes a `Progress` and a `Tell` from its caller: the command line gi
 """
 
 import logging
+import os
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -14,25 +15,55 @@ Item = TypeVar("Item")
 Progress = Callable[..., Iterable[Any]]  # (items, label, total=None) -> the same items, one by one
 Tell = Callable[[str], Any]  # takes a line
 ROOT = logging.getLogger("slamcli")
+AMBER, PLAIN = "\x1b[33m", "\x1b[0m"
+# Counts that a finished stage is told by, the rest with -v; docs/glossary.md says what they mean.
+TOLD = {
+    "extract": ("features", "frames_without_depth", "bad_images"),
+    "match": ("matches_per_pair",),
+    "track": ("key_frames", "landmarks", "lost"),
+    "optimize": ("outliers",),
+    "loop": ("candidates", "closures", "lost"),
+    "densify": ("points",),
+    "octree": ("occupied_cells", "free_cells"),
+    "grid2d": ("occupied", "free"),
+}
+
+
+class _Voice:
+    """How much is told: -v counts up, --quiet leaves nothing but warnings."""
+
+    verbosity = 0
+    is_quiet = False
 
 
 class _StderrHandler(logging.Handler):
     """Write a line above a progress bar that may be on screen, to whatever stderr is at that moment."""
 
     def emit(self, record: logging.LogRecord) -> None:
-        say(f"{record.levelname.capitalize()}: {record.getMessage()}" if record.levelno >= logging.WARNING else record.getMessage())
+        _write(f"{record.levelname.capitalize()}: {record.getMessage()}" if record.levelno >= logging.WARNING else record.getMessage())
 
 
 def say(line: str) -> None:
-    """Write one line to stderr, above a progress bar if there is one."""
+    """Write one line to stderr, above a progress bar if there is one; nothing under `--quiet`."""
+    if not _Voice.is_quiet:
+        _write(line)
+
+
+def amber(text: str) -> str:
+    """Colour what asks for attention, where stderr is a terminal that wants colours."""
+    return f"{AMBER}{text}{PLAIN}" if sys.stderr.isatty() and "NO_COLOR" not in os.environ else text
+
+
+def _write(line: str) -> None:
     if "tqdm" in sys.modules:
         sys.modules["tqdm"].tqdm.write(line, file=sys.stderr)
     else:
         sys.stderr.write(line + "\n")
 
 
-def set_up(verbosity: int) -> None:
-    """Send the log to stderr: warnings, from 1 information, from 2 everything."""
+def set_up(verbosity: int, *, quiet: bool = False) -> None:
+    """Send the log to stderr: warnings, from 1 information, from 2 everything; `quiet` leaves out progress and what was made."""
+    _Voice.verbosity, _Voice.is_quiet = verbosity, quiet
     if not any(isinstance(handler, _StderrHandler) for handler in ROOT.handlers):
         ROOT.addHandler(_StderrHandler())
         ROOT.setLevel(logging.DEBUG)  # log.txt has everything whatever the terminal shows
@@ -67,7 +98,7 @@ def progress(iterable: Iterable[Item], label: str, total: int | None = None) -> 
 
     label : what is done; a last word in [brackets] says what is counted, else frames are
     """
-    if not sys.stderr.isatty():
+    if not sys.stderr.isatty() or _Voice.is_quiet:
         yield from iterable
         return
     from tqdm import tqdm
@@ -87,7 +118,7 @@ def table(rows: Sequence[Sequence[str]], *, right: Iterable[int] = ()) -> str:
 
 
 def stage_line(record: Mapping[str, Any]) -> str:
-    """Tell one finished stage in a line: frames, time, rate, and the counts of its summary."""
+    """Tell one finished stage in a line: frames, time, rate, and counts of its summary; all of these under -v."""
     summary = record["summary"]
     parts = [f"{record['stage']:<9}"]
     if "frames" in summary:
@@ -97,11 +128,21 @@ def stage_line(record: Mapping[str, Any]) -> str:
         parts.append(f"{record['fps']:.1f} fps")
     if record["compile_seconds"] >= 0.5:
         parts.append(f"({record['compile_seconds']:.1f} s of it compiling kernels, this once)")
-    counts = [(name, value) for name, value in summary.items() if name != "frames" and isinstance(value, (int, float, str))]
-    parts += [
-        f"{name.replace('_', ' ')} {value:.4g}" if isinstance(value, float) else f"{name.replace('_', ' ')} {value}"
-        for name, value in counts
-    ]
+    parts += counts(summary, None if _Voice.verbosity else TOLD.get(record["stage"]))
     if record["n_warnings"]:
         parts.append(f"{record['n_warnings']} warnings")
     return "  ".join(parts)
+
+
+def counts(summary: Mapping[str, Any], names: Sequence[str] | None = None) -> list[str]:
+    """Write the numbers and words of a stage's summary as "8609 landmarks"; of those in `names` that are there and not 0, or all."""
+    found = []
+    for name, value in summary.items():
+        if name == "frames" or not isinstance(value, (int, float, str)) or (names is not None and (name not in names or value == 0)):
+            continue
+        word = name.replace("_", " ")
+        if isinstance(value, (bool, str)):
+            found.append(f"{word}: {'yes' if value is True else 'no' if value is False else value}")
+        else:
+            found.append(f"{value:.4g} {word}" if isinstance(value, float) else f"{value} {word}")
+    return found

@@ -53,10 +53,28 @@ def record(**changes: object) -> dict:
 
 
 def test_a_finished_stage_is_told_in_one_line() -> None:
-    assert console.stage_line(record()) == "track      1362 frames  14.2 s  95.9 fps  key frames 173  rms 0.5123"
+    assert console.stage_line(record()) == "track      1362 frames  14.2 s  95.9 fps  173 key frames"
     assert "3 warnings" in console.stage_line(record(n_warnings=3))
     assert "4.5 s of it compiling kernels, this once" in console.stage_line(record(compile_seconds=4.5))
     assert console.stage_line(record(summary={}, fps=None)) == "track      14.2 s"
+
+
+def test_more_of_a_stage_is_told_when_asked_for_and_nothing_when_quiet(capsys: pytest.CaptureFixture) -> None:
+    try:
+        console.set_up(1)
+        assert console.stage_line(record()) == "track      1362 frames  14.2 s  95.9 fps  173 key frames  0.5123 rms"
+        console.set_up(0, quiet=True)
+        console.say("made")
+        logging.getLogger("slamcli.test").warning("frame is dark")
+    finally:
+        console.set_up(0)
+    assert capsys.readouterr().err == "Warning: frame is dark\n"
+
+
+def test_counts_read_as_a_number_and_its_name() -> None:
+    summary = {"frames": 3, "key_frames": 2, "lost": 0, "share": 0.51234, "is_floor_found": True, "spans": [1]}
+    assert console.counts(summary) == ["2 key frames", "0 lost", "0.5123 share", "is floor found: yes"]
+    assert console.counts(summary, ("lost", "key_frames")) == ["2 key frames"]
 
 
 def test_the_meter_sees_time_memory_and_cpu() -> None:

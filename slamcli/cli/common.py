@@ -1,6 +1,8 @@
 """Options that several commands share."""
 
+import math
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, TypeVar
 
 import click
@@ -15,16 +17,50 @@ set_option = click.option(
 config_option = click.option("--config", "config_name", metavar="NAME|FILE", help="Start from fast, accurate, default or a TOML file.")
 
 
-def _verbosity(context: click.Context, parameter: click.Parameter, count: int) -> int:
+class Mount(click.ParamType):
+    """A camera's place on a robot, as six numbers of a URDF's origin."""
+
+    name = "x,y,z,roll,pitch,yaw"
+
+    def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> tuple[float, ...]:
+        """Read six finite numbers."""
+        try:
+            numbers = tuple(float(part) for part in str(value).split(","))
+        except ValueError:
+            numbers = ()
+        if len(numbers) != 6 or not all(math.isfinite(number) for number in numbers):
+            self.fail(f"{value!r} is not x,y,z,roll,pitch,yaw such as 0.1,0,0.3,0,0.2,0", param, ctx)
+        return numbers
+
+
+mount_option = click.option(
+    "--mount",
+    type=Mount(),
+    help="Where the camera's body is on the robot's base [m, rad], as a URDF origin: tell the base's poses instead.",
+)
+
+
+def _voice(context: click.Context, parameter: click.Parameter, value: int) -> int:
+    """Set how much is told, by what the group and the command were given together."""
     from slamcli import console
 
-    context.find_root().ensure_object(dict)
-    total = context.find_root().obj["verbosity"] = context.find_root().obj.get("verbosity", 0) + count
-    console.set_up(total)
-    return count
+    told = context.find_root().ensure_object(dict)
+    told[str(parameter.name)] = told.get(str(parameter.name), 0) + value
+    console.set_up(told.get("verbose", 0), quiet=bool(told.get("quiet", 0)))
+    return value
 
 
 def verbose_option(function: Function) -> Function:
-    """Add `-v`, which counts on the group and on the command together."""
-    option = click.option("-v", "--verbose", count=True, expose_value=False, callback=_verbosity, help="Tell more; -vv tells everything.")
-    return option(function)
+    """Add `-v` and `--quiet`, which count on the group and on the command together."""
+    quiet = click.option("--quiet", is_flag=True, expose_value=False, callback=_voice, help="Tell nothing but warnings and errors.")
+    verbose = click.option("-v", "--verbose", count=True, expose_value=False, callback=_voice, help="Tell more; -vv tells everything.")
+    return quiet(verbose(function))
+
+
+def check_ending(out: Path, *endings: str) -> str:
+    """Return the ending of a file to be written; SlamError when it is none of `endings`."""
+    from slamcli.errors import SlamError
+
+    if out.suffix.lower() not in endings:
+        raise SlamError(f"{out}: the name must end in {' or '.join(endings)}")
+    return out.suffix.lower()

@@ -59,6 +59,13 @@ def _trajectory_options(function: Any) -> Any:
         click.option(
             "--stage", type=click.Choice(["track", "optimize", "loop", "all"]), help="Whose trajectory. [default: the last there is]"
         ),
+        click.option(
+            "--truth",
+            type=click.Path(path_type=Path, dir_okay=False),
+            metavar="FILE",
+            help="True trajectory (TUM format) instead of the recording's.",
+        ),
+        click.option("--truth-offset", type=float, default=0.0, metavar="S", help="Added to the stamps of the truth [s]."),
         click.option("--other", multiple=True, metavar="NAME=FILE", help="Another system's trajectory of this recording (TUM format)."),
         click.option("--plot", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE", help="Draw it (.png, .pdf, .svg)."),
         click.option("--style", type=click.Choice(["text", "csv", "latex"]), default="text", show_default=True, help="Form of the table."),
@@ -71,8 +78,9 @@ def _trajectory_options(function: Any) -> Any:
 @eval_group.command("ape")
 @_trajectory_options
 def ape_command(
-    runs: tuple[str, ...], run: str | None, stage: str | None, other: tuple[str, ...], plot: Path | None, style: str, as_json: bool
-) -> None:
+    runs: tuple[str, ...], run: str | None, stage: str | None, truth: Path | None, truth_offset: float, other: tuple[str, ...],
+    plot: Path | None, style: str, as_json: bool,
+) -> None:  # fmt: skip
     """Absolute pose error: SE(3) alignment, no scale, every colour frame that has a pose.
 
     \b
@@ -80,38 +88,39 @@ def ape_command(
       slamcli eval ape --stage all                   what each stage is worth
       slamcli eval ape runs/a runs/b --style latex   several in one table
       slamcli eval ape --other ORB-SLAM3=f.txt --plot ape.png
+      slamcli eval ape --truth mocap.txt --truth-offset -1.2
     """
     from slamcli.evaluation import plots, tables, trajectory_error
 
     results = []
     for folder in _open_runs(runs, run):
-        truth, n_frames = trajectory_error.ground_truth(folder), len(_frame_stamp(folder))
+        true, n_frames = _truth(folder, truth, truth_offset), trajectory_error.frame_count(folder)
         for name, which, estimate in _trajectories(folder, stage, other):
-            results.append(trajectory_error.ape(estimate, truth, n_frames=n_frames, name=name, stage=which))
+            results.append(trajectory_error.ape(estimate, true, n_frames=n_frames, name=name, stage=which))
             if which:
                 _record(folder, "ape.json", results[-1].to_dict())
     if plot is not None:
         plots.plot_ape(results, plot)
     rows = [result.to_dict() for result in results]
-    click.echo(_json(rows) if as_json else tables.render(rows, APE_COLUMNS, style))
+    click.echo(_json(rows, several=_are_several(runs, stage, other)) if as_json else tables.render(rows, APE_COLUMNS, style))
 
 
 @eval_group.command("rpe")
 @_trajectory_options
 @click.option("--seconds", type=click.FloatRange(min=0, min_open=True), default=1.0, show_default=True, help="Interval.")
 def rpe_command(
-    runs: tuple[str, ...], run: str | None, stage: str | None, other: tuple[str, ...], plot: Path | None, style: str, as_json: bool,
-    seconds: float,
+    runs: tuple[str, ...], run: str | None, stage: str | None, truth: Path | None, truth_offset: float, other: tuple[str, ...],
+    plot: Path | None, style: str, as_json: bool, seconds: float,
 ) -> None:  # fmt: skip
     """Relative pose error: drift over one second, and from one frame to the next."""
     from slamcli.evaluation import plots, tables, trajectory_error
 
     results, rows = [], []
     for folder in _open_runs(runs, run):
-        truth, frame_stamp = trajectory_error.ground_truth(folder), _frame_stamp(folder)
+        true, frame_stamp = _truth(folder, truth, truth_offset), _frame_stamp(folder)
         for name, which, estimate in _trajectories(folder, stage, other):
             over_time, per_frame = (
-                trajectory_error.rpe(estimate, truth, frame_stamp=frame_stamp, name=name, stage=which, seconds=interval)
+                trajectory_error.rpe(estimate, true, frame_stamp=frame_stamp, name=name, stage=which, seconds=interval)
                 for interval in (seconds, None)
             )
             results.append(over_time)
@@ -121,7 +130,7 @@ def rpe_command(
     if plot is not None:
         plots.plot_rpe(results, plot)
     flat = [part for row in rows for part in (row, row["per_frame"])]
-    click.echo(_json(rows) if as_json else tables.render(flat, RPE_COLUMNS, style))
+    click.echo(_json(rows, several=_are_several(runs, stage, other)) if as_json else tables.render(flat, RPE_COLUMNS, style))
 
 
 @eval_group.command("map")
@@ -211,5 +220,21 @@ def _record(folder: RunDir, file: str, figures: dict) -> None:
         click.echo(f"Warning: {target} cannot be written ({error.strerror})", err=True)
 
 
-def _json(rows: list[dict]) -> str:
-    return json.dumps(rows[0] if len(rows) == 1 else rows, indent=1)
+def _truth(folder: RunDir, file: Path | None, offset: float) -> Trajectory:
+    """Read the true trajectory, from `file` or of the recording, its stamps moved by `offset` [s]."""
+    from dataclasses import replace
+
+    from slamcli.evaluation import trajectory_error
+    from slamcli.formats.trajectory import read_tum
+
+    truth = read_tum(file) if file is not None else trajectory_error.ground_truth(folder)
+    return replace(truth, stamp=truth.stamp + offset)
+
+
+def _are_several(runs: tuple[str, ...], stage: str | None, other: tuple[str, ...]) -> bool:
+    return len(runs) > 1 or stage == "all" or bool(other)
+
+
+def _json(rows: list[dict], *, several: bool = False) -> str:
+    """Write one object or, where several were asked for, a list, however many there are."""
+    return json.dumps(rows if several else rows[0], indent=1)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from slamcli.cli.common import json_option, run_option
+from slamcli.cli.common import json_option, mount_option, run_option
 
 if TYPE_CHECKING:
     import numpy as np
@@ -23,12 +23,14 @@ class Place(click.ParamType):
 
     name = "x,y"
 
-    def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> tuple[float, float]:
-        """Read two numbers."""
+    def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> tuple[float, float] | str:
+        """Read two numbers, or `first` and `last`: below the camera at the recording's first and last frame."""
+        if value in ("first", "last"):
+            return str(value)
         try:
             x, y = (float(part) for part in str(value).split(","))
         except ValueError:
-            self.fail(f"{value!r} is not a place such as 0.5,1.0", param, ctx)
+            self.fail(f"{value!r} is not a place such as 0.5,1.0, first or last", param, ctx)
         return x, y
 
 
@@ -38,12 +40,19 @@ class Place(click.ParamType):
 @click.option(
     "--png", type=click.Path(path_type=Path, dir_okay=False), help="Also draw a picture with the trajectory, a scale bar and a legend."
 )
-def export_grid(out: Path, run: str | None, png: Path | None) -> None:
+@mount_option
+@json_option
+def export_grid(out: Path, run: str | None, png: Path | None, mount: tuple[float, ...] | None, as_json: bool) -> None:
     """Write the navigation grid OUT (.pgm) and its page (.yaml) beside it, for map_server and nav2.
+
+    The page's first line tells where the recording began: a robot's initial pose there, with --mount that of its base.
 
     \b
       slamcli export-grid map.pgm --png map.png
+      slamcli export-grid map.pgm --mount 0.1,0,0.3,0,0.2,0
     """
+    import numpy as np
+
     from slamcli.formats import grid_map
     from slamcli.runs.run_directory import RunDir
     from slamcli.schema import Grid
@@ -51,19 +60,39 @@ def export_grid(out: Path, run: str | None, png: Path | None) -> None:
     folder = RunDir.find(run)
     grid = folder.load(Grid, "grid2d")
     warn_without_floor(folder)
-    written: tuple[Path, ...] = grid_map.write(out, grid_map.GridMap(grid.state, tuple(grid.origin.tolist()), float(grid.resolution)))
+    start = _start(folder, mount)
+    written: tuple[Path, ...] = grid_map.write(out, grid_map.GridMap.of(grid), start=start)
     if png is not None:
         from slamcli.visualization.grid_picture import save_picture
 
         save_picture(png, grid, trajectory=camera_path(folder), title=str(folder.info()["dataset"]))
         written = (*written, png)
     rows, columns = grid.state.shape
+    if as_json:
+        about = {"out": [str(path) for path in written], "columns": columns, "rows": rows, "resolution": float(grid.resolution)}
+        click.echo(
+            json.dumps(about | {"origin": np.round(grid.origin, 9).tolist(), "start": dict(zip(("x", "y", "yaw"), start, strict=True))})
+        )
+        return
     click.echo(f"{', '.join(str(path) for path in written)}: {columns} x {rows} cells of {float(grid.resolution):g} m", err=True)
 
 
+def _start(folder: RunDir, mount: tuple[float, ...] | None) -> tuple[float, float, float]:
+    """Return x, y, yaw in the level frame of the first frame's camera or, where it is mounted on one, of the robot's base."""
+    from slamcli.navigation.robot_pose import base_in_camera, base_pose
+    from slamcli.runs import placement
+    from slamcli.schema import Ground
+
+    if mount is None:
+        return placement.read(folder).first
+    return base_pose(folder.load(Ground, "densify").T_lw @ placement.camera_poses(folder)[0], base_in_camera(mount))
+
+
 @click.command()
-@click.option("--start", type=Place(), required=True, help="Where the robot is, such as 0.5,1.0 [m].")
-@click.option("--goal", type=Place(), required=True, help="Where it is to go [m].")
+@click.option(
+    "--start", type=Place(), required=True, help="Where the robot is, such as 0.5,1.0 [m], or first or last: below the camera there."
+)
+@click.option("--goal", type=Place(), required=True, help="Where it is to go: x,y [m], first or last.")
 @run_option
 @click.option("--map", "page", type=click.Path(path_type=Path, dir_okay=False), help="Plan on this grid map (.yaml) instead of the run's.")
 @click.option("--radius", default=0.2, show_default=True, help="Of the robot [m].")
@@ -74,7 +103,7 @@ def export_grid(out: Path, run: str | None, png: Path | None) -> None:
 @click.option("--png", type=click.Path(path_type=Path, dir_okay=False), help="Draw the path. [default: plan.png in the run directory]")
 @json_option
 def plan(
-    start: tuple[float, float], goal: tuple[float, float], run: str | None, page: Path | None, radius: float, clearance: float,
+    start: tuple[float, float] | str, goal: tuple[float, float] | str, run: str | None, page: Path | None, radius: float, clearance: float,
     weight: float, allow_unknown: bool, out: Path | None, png: Path | None, as_json: bool,
 ) -> None:  # fmt: skip
     """Plan a path on the navigation grid and draw it; prints it as CSV: x,y,clearance in metres, level frame.
@@ -82,6 +111,7 @@ def plan(
     The level frame's origin is below the first camera, x its heading, z up. What was never seen counts as blocked.
 
     \b
+      slamcli plan --start first --goal last
       slamcli plan --start 0.5,1.0 --goal 3,2
       slamcli plan --start 0.5,1.0 --goal 3,2 -o path.json --png path.png
     """
@@ -99,6 +129,7 @@ def plan(
         png = png or folder.path / "plan.png"
     else:
         grid, title = _read_map(page), page.name
+    start, goal = _ends(grid, start, goal, trajectory, radius=radius, allow_unknown=allow_unknown)
     route = planner.plan(grid, start, goal, radius=radius, clearance=clearance, weight=weight, allow_unknown=allow_unknown)
     texts = {".csv": _csv(route), ".json": _json(route, start, goal, radius)}
     if out is not None:
@@ -109,6 +140,40 @@ def plan(
     least = f"{float(route.clearance.min()) + radius:.2f} m"
     picture = f"; drawn in {png}" if png else ""
     click.echo(f"{route.length:.2f} m, never nearer than {least} to what is not free{picture}", err=True)
+
+
+def _ends(
+    grid: Grid,
+    start: tuple[float, float] | str,
+    goal: tuple[float, float] | str,
+    path: np.ndarray | None,
+    *,
+    radius: float,
+    allow_unknown: bool,
+) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Turn `first` and `last` into places where the robot has room, and say how far these are from the camera's."""
+    import numpy as np
+
+    from slamcli.errors import SlamError
+    from slamcli.navigation import planner
+
+    ends = {"start": start, "goal": goal}
+    named = {name: end for name, end in ends.items() if isinstance(end, str)}
+    if named:
+        if path is None:
+            raise SlamError("--map: a map file does not tell where a camera was; give --start and --goal as x,y")
+        known = path[np.isfinite(path).all(axis=1)]
+        camera = {name: (float(known[i, 0]), float(known[i, 1])) for name, end in named.items() for i in (0 if end == "first" else -1,)}
+        fixed = [end for end in ends.values() if not isinstance(end, str)]
+        found = planner.nearest_room(grid, list(camera.values()), radius=radius, allow_unknown=allow_unknown, fixed=fixed)
+        for name, place in zip(named, found, strict=True):
+            ends[name] = place
+            off = float(np.hypot(place[0] - camera[name][0], place[1] - camera[name][1]))
+            if off > float(grid.resolution):
+                click.echo(
+                    f"{name}: {place[0]:.2f},{place[1]:.2f}, the nearest place with room, {off:.2f} m from below the camera", err=True
+                )
+    return ends["start"], ends["goal"]  # type: ignore[return-value]
 
 
 def _csv(route: Route) -> str:

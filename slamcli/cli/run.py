@@ -10,6 +10,8 @@ from slamcli.cli.common import config_option, json_option, run_option, set_optio
 from slamcli.stages import NAMES, STAGES, Stage
 
 if TYPE_CHECKING:
+    from slamcli.evaluation.map_verdict import Verdict
+    from slamcli.runs.placement import Placement
     from slamcli.runs.run_directory import RunDir
     from slamcli.runs.staleness import State
 
@@ -25,6 +27,7 @@ STAGE = click.Choice(NAMES)
 @click.option("--from", "start", type=STAGE, help="Run this stage and those after it even if they are up to date.")
 @click.option("--until", type=STAGE, help="Stop after this stage.")
 @click.option("--force", is_flag=True, help="Run every stage even if it is up to date.")
+@json_option
 def run_command(
     target: str | None,
     run: str | None,
@@ -34,11 +37,12 @@ def run_command(
     start: str | None,
     until: str | None,
     force: bool,
+    as_json: bool,
 ) -> None:
     """Bring a run up to date: exactly the stages that need it.
 
     TARGET is a recording: `demo` for a simulated room, a folder, or a name such as `tum/fr1_room`, which is downloaded when it is not
-    found. Without TARGET an existing run goes on. Prints the run directory.
+    found. Without TARGET an existing run goes on. Prints the run directory; with --json what was made and how good the map is.
 
     \b
       slamcli run demo
@@ -46,15 +50,59 @@ def run_command(
       slamcli run path/to/recording -r runs/mine --config accurate
     """
     from slamcli import api, console
-    from slamcli.runs.summary import outcome
 
     named = run or os.environ.get("SLAMCLI_RUN")
     options: dict[str, Any] = {"settings": assignments, "config": config_name, "start": start, "until": until, "force": force}
     options |= {"progress": console.progress, "tell": console.say}
     done = api.open_run(named).update(**options) if target is None else api.run(target, path=named, data=data, **options)
-    if until is None and (made := outcome(done.directory)):
-        console.say(made)
+    if as_json:
+        click.echo(json.dumps(_made_object(done.directory), indent=1))
+        return
+    if until is None:
+        _tell_made(done.directory)
     click.echo(done.path)
+
+
+def _tell_made(rundir: "RunDir") -> None:
+    """Tell what a finished run made, whether a robot could use the map, and what comes next."""
+    from slamcli import console
+    from slamcli.runs import placement, summary
+
+    if not (made := summary.outcome(rundir)):
+        return
+    console.say(made)
+    where, verdict = _place_and_verdict(rundir)
+    if where is not None and verdict is not None:
+        for name, told in (*placement.lines(where), ("map", verdict.summary)):
+            console.say(f"{name:<10}  {told}")
+        for finding in verdict.findings:
+            console.say(console.amber(f"{'amber' if finding.is_grave else 'note':<10}  {finding}"))
+    console.say("next: " + "\n      ".join(summary.next_commands(rundir)))
+
+
+def _place_and_verdict(rundir: "RunDir") -> "tuple[Placement | None, Verdict | None]":
+    """Read where a run's frames lie and judge its map; nothing where its files do not tell."""
+    from slamcli import console
+    from slamcli.errors import SlamError
+    from slamcli.evaluation import map_verdict
+    from slamcli.runs import placement
+
+    try:
+        return placement.read(rundir), map_verdict.of_run(rundir)
+    except SlamError as error:
+        console.say(f"{'map':<10}  not judged: {error}")
+        return None, None
+
+
+def _made_object(rundir: "RunDir") -> dict[str, Any]:
+    from slamcli.runs import summary
+
+    where, verdict = _place_and_verdict(rundir) if rundir.record("grid2d") is not None else (None, None)
+    return summary.to_dict(rundir) | {
+        "frames": where.to_dict() if where is not None else None,
+        "map": verdict.to_dict() if verdict is not None else None,
+        "next": summary.next_commands(rundir),
+    }
 
 
 def _stage_command(stage: Stage) -> click.Command:

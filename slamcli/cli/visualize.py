@@ -12,6 +12,7 @@ from slamcli.cli.common import json_option, run_option
 
 if TYPE_CHECKING:
     from slamcli.inspection import Inspection
+    from slamcli.runs.run_directory import RunDir
 
 BAR = 30  # characters of the longest bar in a histogram
 
@@ -82,18 +83,39 @@ def _facts(facts: dict) -> list[str]:
 @click.command(short_help="Write one HTML page about a run.")
 @run_option
 @click.option("-o", "--out", type=click.Path(path_type=Path, dir_okay=False), help="The page. [default: report.html in the run directory]")
-def report(run: str | None, out: Path | None) -> None:
+@click.option("--inspect/--no-inspect", "with_inspection", default=True, help="Look through the recording for faults, once a recording.")
+def report(run: str | None, out: Path | None, with_inspection: bool) -> None:
     """Write one HTML page about a run: trajectory, errors, maps, timings, warnings, configuration.
 
     The page needs nothing but itself: no network, no folder beside it.
     """
     from slamcli import report as report_page
+    from slamcli.evaluation.trajectory_error import last_stage
     from slamcli.runs.run_directory import RunDir
 
     folder = RunDir.find(run)
+    last_stage(folder)  # there is something to report, or this says what is missing
     target = out or folder.path / "report.html"
-    report_page.make(folder, target)
+    report_page.make(folder, target, inspected=_findings(folder) if with_inspection else ())
     click.echo(target)
+
+
+def _findings(folder: RunDir) -> list[tuple[str, str]]:
+    """Inspect a run's recording, or read what an earlier look at the same recording found; nothing where it is gone."""
+    from slamcli import console, files, inspection
+    from slamcli.errors import SlamError
+
+    kept, digest = folder.path / "inspection.json", folder.info()["digest"]
+    try:
+        known = files.read_json(kept) if kept.is_file() else {}
+        if known.get("digest") != digest:
+            found = inspection.inspect(folder.info()["root"], camera=dict(folder.config().camera) or None, progress=console.progress)
+            known = {"digest": digest, **found.to_dict()}
+            files.write_text(kept, json.dumps(known, indent=1) + "\n")
+        return [(one["level"], f"{one['message']}: {one['advice']}".removesuffix(": ")) for one in known["findings"]]
+    except (SlamError, OSError, KeyError, TypeError, AttributeError) as error:
+        console.say(f"the recording is not inspected: {error}")
+        return []
 
 
 @click.command(short_help="Show a run in the Rerun viewer.")

@@ -340,6 +340,7 @@ class GridConfig:
     min_range: float = option(0.3, "nearer readings are ignored [m]", ge=0)
     max_range: float = option(4.0, "farther readings are ignored [m]", gt=0, le=100)
     extend_down: bool = option(True, "an upright surface that leaves the picture downwards is taken to reach the floor")
+    driven: float = option(0.0, "floor within this of the camera's path is free: for recordings made on a robot; 0 = off [m]", ge=0, le=5)
     n_low: int = option(3, "n_l of (20): a cell with fewer points in a view is empty", ge=1)
     n_high: int = option(8, "n_h of (20): a cell with more points in a view is occupied", ge=1)
     update: str = option("evidence", "how views add up: log-odds, or (22), (23) as printed", choices=("evidence", "paper"))

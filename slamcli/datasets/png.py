@@ -9,6 +9,7 @@ PNG: ISO/IEC 15948, section 9 for the filters.
 import struct
 import zlib
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 from numba import int32, types, u1, u8, uint8, uint16, uintp
@@ -26,7 +27,7 @@ HARMLESS = frozenset({b"pHYs", b"tEXt", b"zTXt", b"iTXt", b"tIME", b"gAMA", b"cH
 PLAIN, SUB, UP, AVERAGE, PAETH = range(5)  # how a row is filtered
 ZERO, ONE, TWO, THREE = (np.uintp(n) for n in range(4))  # unsigned: an index that may be negative is tested for and wrapped
 
-_Bytes = types.Array(types.uint8, 1, "C", readonly=True)
+_Bytes: Any = types.Array(types.uint8, 1, "C", readonly=True)
 
 
 def _inflater() -> ModuleType:

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from slamcli.datasets import images
+from slamcli.datasets import images, png
 from slamcli.datasets.bags import HEAD, Bag, Topic
-from slamcli.datasets.images import PNG_MAGIC, Picture, Pixels, check_whole
+from slamcli.datasets.images import Picture, Pixels, check_whole
 from slamcli.errors import BadFrame, SlamError
 from slamcli.formats import ros_messages, rvl
 from slamcli.formats.ros_messages import Image
@@ -117,7 +117,7 @@ def _compressed(message: Image, where: str) -> bytes | np.ndarray:
     if not is_depth(message, is_compressed=True):
         check_whole(message.data, where)
         return message.data
-    if "compresseddepth" not in message.encoding.lower() and message.data.startswith(PNG_MAGIC):
+    if "compresseddepth" not in message.encoding.lower() and message.data.startswith(png.MAGIC):
         return message.data
     return compressed_depth(message.data, message.encoding, where)
 

@@ -7,12 +7,13 @@ import numpy as np
 
 from slamcli import schema
 from slamcli.errors import SlamError
-from slamcli.evaluation import trajectory_error
+from slamcli.evaluation import map_verdict, trajectory_error
+from slamcli.evaluation.map_verdict import Verdict
 from slamcli.evaluation.trajectory_error import Ape
 from slamcli.geometry import se3
 from slamcli.runs.run_directory import RunDir
 from slamcli.runs.staleness import State
-from slamcli.schema import Closures, Features, Ground, Map, Tracks, Trajectory
+from slamcli.schema import LOST, Closures, Features, Ground, Map, Tracks, Trajectory
 
 UPRIGHT = np.array(
     [[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
@@ -24,6 +25,7 @@ class Content:
     """A run as the page shows it. `F` frames; poses in the level frame, z up."""
 
     name: str
+    flag: str  # -r and the run's folder, for hints
     stage: str  # whose trajectory is shown
     stamp: np.ndarray  # (F,) [s]
     T_lc: np.ndarray  # (F, 4, 4), NaN = lost
@@ -38,11 +40,22 @@ class Content:
     states: dict[str, State]
     recording: dict[str, Any]
     doubts: list[str] = field(default_factory=list)  # of the recording's reader
+    verdict: Verdict | None = None  # on the map, where there is one
 
     @property
     def has_pose(self) -> np.ndarray:
         """Say which frames have a pose."""
         return np.isfinite(self.T_lc[:, 0, 0])
+
+    @property
+    def n_lost(self) -> int:
+        """Count the frames that no map segment holds."""
+        return int((self.state == LOST).sum())
+
+    @property
+    def n_apart(self) -> int:
+        """Count the frames of map segments that could not be joined to the main one."""
+        return len(self.stamp) - self.n_lost - int(self.has_pose.sum())
 
     def summary(self, stage: str) -> dict[str, Any]:
         """Give what a stage said of itself; nothing where it was not run."""
@@ -61,6 +74,7 @@ def collect(run: RunDir) -> Content:
     recording, doubts = _recording(run)
     return Content(
         name=str(run.info()["dataset"]),
+        flag=run.flag,
         stage=stage,
         stamp=np.array(features.stamp),
         T_lc=T_lc,
@@ -75,6 +89,7 @@ def collect(run: RunDir) -> Content:
         states=run.states(),
         recording=recording,
         doubts=doubts,
+        verdict=map_verdict.of_run(run),
     )
 
 

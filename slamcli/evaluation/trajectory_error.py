@@ -15,6 +15,7 @@ import numpy as np
 
 from slamcli.datasets.association import MAX_DIFFERENCE, associate
 from slamcli.errors import SlamError
+from slamcli.formats.trajectory import read_tum
 from slamcli.geometry import se3
 from slamcli.schema import Features, Map, Tracks, Trajectory, trajectory
 
@@ -109,12 +110,20 @@ def last_stage(run: Any) -> str:
     for stage in reversed(STAGES):
         if run.record(stage) is not None:
             return stage
-    raise SlamError(f"{run.path}: no stage has made a trajectory yet; try: slamcli run --until track")
+    raise SlamError(f"{run.path}: no stage has made a trajectory yet; try: slamcli run --until track {run.flag}")
 
 
 def stage_trajectory(run: Any, stage: str) -> Trajectory:
-    """Give the poses of all frames that have one after a stage."""
+    """Return the poses of all frames that have one after a stage; from its file, to the nanometre, where extract was cleared away."""
+    if run.record("extract") is None:
+        return read_tum(run.stage_path(stage, "trajectory.txt"))
     return trajectory(run.load(Features, "extract").stamp, run.load(Tracks, stage), run.load(Map, stage))
+
+
+def frame_count(run: Any) -> int:
+    """Count the colour frames of a run's recording, as any of its stages knows them."""
+    records = (run.record(stage) for stage in ("extract", *reversed(STAGES)))
+    return next(int(record["summary"]["frames"]) for record in records if record is not None)
 
 
 def ground_truth(run: Any) -> Trajectory:
@@ -124,7 +133,7 @@ def ground_truth(run: Any) -> Trajectory:
     if truth is None:
         raise SlamError(
             f"{dataset.root}: no ground truth, so there is nothing to compare with; "
-            "put a groundtruth.txt (timestamp tx ty tz qx qy qz qw) there, or look at the result with: slamcli report"
+            f"put a groundtruth.txt (timestamp tx ty tz qx qy qz qw) there, give one with --truth, or look at the result with: slamcli report {run.flag}"
         )
     return truth
 

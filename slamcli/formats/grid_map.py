@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from slamcli.errors import SlamError
+from slamcli.schema import Grid
 
 OCCUPIED, FREE, UNKNOWN = 1, 0, -1
 GREY = {OCCUPIED: 0, FREE: 254, UNKNOWN: 205}
@@ -30,9 +31,18 @@ class GridMap:
     origin: tuple[float, float]  # m, outer corner of cell (0, 0)
     resolution: float  # m, side of a cell
 
+    @classmethod
+    def of(cls, grid: Grid) -> "GridMap":
+        """Take a run's grid, its numbers without the tails that sums of cells leave (-1.1500000000000001)."""
+        x, y = (round(float(value), 9) + 0.0 for value in grid.origin)
+        return cls(grid.state, (x, y), round(float(grid.resolution), 9))
 
-def write(path: Path, grid: GridMap) -> tuple[Path, Path]:
-    """Write `path` (.pgm) and the YAML page of the same name beside it; returns both paths."""
+
+def write(path: Path, grid: GridMap, *, start: tuple[float, float, float] | None = None) -> tuple[Path, Path]:
+    """Write `path` (.pgm) and the YAML page of the same name beside it; returns both paths.
+
+    start : x [m], y [m], yaw [rad] where the recording began, told in a comment of the page: a robot's initial pose
+    """
     path = Path(path)
     if path.suffix != ".pgm":
         raise SlamError(f"{path}: a grid map's name ends in .pgm; its page map.yaml is written beside it")
@@ -42,8 +52,12 @@ def write(path: Path, grid: GridMap) -> tuple[Path, Path]:
     rows, columns = grid.state.shape
     x, y = float(grid.origin[0]), float(grid.origin[1])
     page = path.with_suffix(".yaml")
+    told = ""
+    if start is not None:
+        x_start, y_start, yaw = (round(value, 4) + 0.0 for value in start)  # + 0.0: no -0.0
+        told = f"# start: x {x_start}, y {y_start}, yaw {yaw} [m, m, rad] where the recording began\n"
     text = (
-        f"image: {_quoted(path.name)}\nmode: trinary\nresolution: {grid.resolution!r}\norigin: [{x!r}, {y!r}, 0.0]\n"
+        f"{told}image: {_quoted(path.name)}\nmode: trinary\nresolution: {grid.resolution!r}\norigin: [{x!r}, {y!r}, 0.0]\n"
         f"negate: 0\noccupied_thresh: {OCCUPIED_THRESH}\nfree_thresh: {FREE_THRESH}\n"
     )
     try:

@@ -5,6 +5,7 @@ then pulled tight: a straight stretch replaces a run of cells where it costs no 
 doi:10.1109/TSSC.1968.300136.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -51,6 +52,33 @@ def plan(
     xy = _dense(np.concatenate([[start], xy[1:-1], [goal]]) if len(xy) > 1 else np.array([start, goal]), float(grid.resolution))
     rows, columns = _cells_of(grid, xy)
     return Route(xy=xy, clearance=margin[rows, columns], length=float(np.linalg.norm(np.diff(xy, axis=0), axis=1).sum()))
+
+
+def nearest_room(
+    grid: Grid, places: Sequence[tuple[float, float]], *, radius: float, allow_unknown: bool, fixed: Sequence[tuple[float, float]] = ()
+) -> list[tuple[float, float]]:
+    """Find, near each of `places` [m, level frame], one where a robot has room, all within one region that it can drive through.
+
+    The region is the one that moves them least; `fixed` places that are in one decide it. A camera does not see the floor below itself,
+    so where it stood is often unknown. Raises SlamError where the robot fits nowhere.
+    """
+    from scipy import ndimage
+
+    margin = obstacle_distance(grid, allow_unknown=allow_unknown) - radius
+    labels, n_regions = ndimage.label(margin >= 0.0, structure=np.ones((3, 3), dtype=int))
+    if n_regions == 0:
+        raise SlamError(f"a robot of {radius:g} m radius fits nowhere in this grid: try a smaller --radius or --allow-unknown")
+    rows, columns = np.nonzero(labels)
+    xy, region = (np.stack([columns, rows], axis=1) + 0.5) * float(grid.resolution) + grid.origin, labels[rows, columns]
+    distance = [np.linalg.norm(xy - place, axis=1) for place in places]
+    index = np.arange(1, n_regions + 1)
+    best = index[np.argmin(np.sum([ndimage.minimum(d, region, index) for d in distance], axis=0))]
+    for place in fixed:
+        row, column = (int(i) for i in _cells_of(grid, np.array(place)))
+        if 0 <= row < labels.shape[0] and 0 <= column < labels.shape[1] and labels[row, column]:
+            best = labels[row, column]
+    found = [np.flatnonzero(region == best)[d[region == best].argmin()] for d in distance]
+    return [(float(xy[i, 0]), float(xy[i, 1])) for i in found]
 
 
 def obstacle_distance(grid: Grid, *, allow_unknown: bool) -> np.ndarray:

@@ -1,12 +1,13 @@
 """What a reader of the page should know before trusting the result, in plain words."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from slamcli.evaluation.run_content import Content
 from slamcli.runs.staleness import MISSING
-from slamcli.schema import LOST, ON_SHAPE, RELOCALISED, TRACKED
+from slamcli.schema import ON_SHAPE, RELOCALISED, TRACKED
 
 GOOD, NOTE, BAD = "good", "note", "bad"
 FEW_FEATURES = 150  # in a frame
@@ -25,23 +26,35 @@ class Remark:
     text: str
 
 
-def remarks(content: Content) -> list[Remark]:
-    """Judge a run; the gravest first."""
+def remarks(content: Content, inspected: Sequence[tuple[str, str]] = ()) -> list[Remark]:
+    """Judge a run; the gravest first.
+
+    inspected : level ("error", "warning" or "note") and text of each finding on the recording itself
+    """
     found = [
+        *_map(content),
         *_poses(content),
         *_features(content),
         *_loops(content),
         *_scale(content),
         *_floor(content),
         *_stages(content),
-        *(Remark(NOTE, f"Recording: {text}") for text in content.doubts),
+        *(Remark(NOTE, f"Recording: {text}") for text in content.doubts if not inspected),
+        *(Remark(BAD if level == "error" else NOTE, f"Recording: {text}") for level, text in inspected),
     ]
     return sorted(found, key=lambda remark: (BAD, NOTE, GOOD).index(remark.kind))
 
 
+def _map(content: Content) -> list[Remark]:
+    verdict = content.verdict
+    if verdict is None:
+        return []
+    findings = [Remark(NOTE, f"{'A robot could not use this map' if f.is_grave else 'Map'}: {f}.") for f in verdict.findings]
+    return [*findings, *([Remark(GOOD, f"A robot can use the map: {verdict.summary}.")] if verdict.is_usable else [])]
+
+
 def _poses(content: Content) -> list[Remark]:
-    n, lost = len(content.stamp), int((content.state == LOST).sum())
-    apart = n - lost - int(content.has_pose.sum())
+    n, lost, apart = len(content.stamp), content.n_lost, content.n_apart
     if apart:
         text = f"{apart} of {n} frames belong to map segments that could not be joined to the main one; no map shows what they saw."
         return [Remark(BAD if apart > MANY * n else NOTE, text), *(_lost(content) if lost else [])]
@@ -49,7 +62,7 @@ def _poses(content: Content) -> list[Remark]:
 
 
 def _lost(content: Content) -> list[Remark]:
-    n, lost = len(content.stamp), int((content.state == LOST).sum())
+    n, lost = len(content.stamp), content.n_lost
     spans = content.summary("track").get("lost_spans") or []
     where = "; ".join(
         f"{first} to {last}: {reason}" if last > first else f"{first}: {reason}" for first, last, reason in spans[:MOST_SPANS]
@@ -111,9 +124,9 @@ def _stages(content: Content) -> list[Remark]:
     found = []
     for stage, state in content.states.items():
         if state.state == MISSING:
-            found.append(Remark(NOTE, f"{stage} has not been run; go on with: slamcli run"))
+            found.append(Remark(NOTE, f"{stage} has not been run; go on with: slamcli run {content.flag}"))
         elif not state.is_fresh:
-            found.append(Remark(BAD, f"{stage} is {state.state} ({state.reason}); bring it up to date with: slamcli run"))
+            found.append(Remark(BAD, f"{stage} is {state.state} ({state.reason}); bring it up to date with: slamcli run {content.flag}"))
         warnings = [
             text
             for text in state.record.get("warnings", [])

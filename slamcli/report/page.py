@@ -4,6 +4,7 @@ import html
 import json
 import platform
 import re
+from collections.abc import Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime
 from importlib import resources
@@ -21,16 +22,17 @@ from slamcli.report.pictures import Picture
 MOST_TRUTH_POINTS = 6000
 
 
-def render(content: Content, pictures: list[Picture]) -> str:
-    """Fill the template."""
+def render(content: Content, pictures: list[Picture], inspected: Sequence[tuple[str, str]] = ()) -> str:
+    """Fill the template; `inspected` are findings on the recording, as `report.make` takes them."""
     parts = {
         "title": html.escape(f"slamcli report: {content.name}"),
         "name": html.escape(content.name),
         "headline": html.escape(doubts.headline(content)),
         "cards": _cards(content),
-        "remarks": _remarks(doubts.remarks(content)),
+        "remarks": _remarks(doubts.remarks(content, inspected)),
         "errors": _errors(content),
-        "maps": "".join(_picture(picture) for picture in pictures) or "<p>No map has been made yet; go on with: slamcli run</p>",
+        "maps": "".join(_picture(picture) for picture in pictures)
+        or f"<p>No map has been made yet; go on with: slamcli run {html.escape(content.flag)}</p>",
         "timings": _timings(content),
         "recording": _pairs({"folder": content.recording["root"], **content.recording["camera"]}),
         "configuration": _configuration(content),
@@ -85,14 +87,19 @@ def _cards(content: Content) -> str:
     ]
     if content.ape.get(content.stage):
         cards.insert(0, ("APE RMSE", f"{1000 * _rmse(content.ape[content.stage]):.1f} mm"))
+    if content.verdict is not None:
+        cards.insert(1, ("free floor", f"{content.verdict.evidence.free_area:.1f} m\u00b2"))
     cards += [
         ("landmarks", content.summary(content.stage).get("landmarks")),
         ("cloud points", content.summary("densify").get("points")),
         ("time per frame", f"{1000 * seconds / n:.0f} ms"),
         ("peak memory", f"{max(record.get('peak_rss_mb', 0.0) for record in records):.0f} MiB"),
     ]
+    is_doubtful = content.verdict is not None and not content.verdict.is_usable
     return "".join(
-        f'<div class="card"><b>{html.escape(_thousands(value))}</b><span>{name}</span></div>' for name, value in cards if value is not None
+        f'<div class="card{" amber" if name == "free floor" and is_doubtful else ""}"><b>{html.escape(_thousands(value))}</b><span>{name}</span></div>'
+        for name, value in cards
+        if value is not None
     )
 
 

@@ -168,6 +168,7 @@ class Pipeline:
         first_forced = NAMES.index(start) if start else 0 if force else len(NAMES)
         if start and last < first_forced:
             raise SlamError(f"--from {start} --until {until}: {until} comes before {start}")
+        self._tell(f"{self.run.info()['dataset']} -> {self.run.path}")
         for index, stage in enumerate(STAGES[: last + 1]):
             state = self.states()[stage.name]
             if state.is_fresh and index < first_forced:
@@ -183,11 +184,19 @@ class Pipeline:
         stage, states = stage_named(name), self.states()
         for need in (states[n] for n in stage.needs if n != "dataset"):
             if need.state == staleness.MISSING:
-                raise SlamError(f"{name} needs {need.stage}, which has not been run; try: slamcli run --until {need.stage}")
+                raise SlamError(f"{name} needs {need.stage}, which has not been run; try: slamcli run --until {need.stage} {self.run.flag}")
             if need.state == staleness.DAMAGED:
-                raise SlamError(f"{name} needs {need.stage}, which is damaged ({need.reason}); try: slamcli run --until {need.stage}")
+                raise SlamError(
+                    f"{name} needs {need.stage}, which is damaged ({need.reason}); try: slamcli run --until {need.stage} {self.run.flag}"
+                )
             if not need.is_fresh:
-                log.warning("%s rests on %s, which is stale (%s); slamcli run would bring it up to date", name, need.stage, need.reason)
+                log.warning(
+                    "%s rests on %s, which is stale (%s); bring it up to date with: slamcli run %s",
+                    name,
+                    need.stage,
+                    need.reason,
+                    self.run.flag,
+                )
         self.run_stage(stage)
 
     def run_stage(self, stage: Stage) -> None:
@@ -204,7 +213,9 @@ class Pipeline:
                     module = importlib.import_module(f"slamcli.stages.{stage.name}")
                     meter.watch_compiler(self._tell)
                     summary = module.run(Inputs(stage, self.run, self.dataset), out, Settings(stage, self.config), tools)
-            except KeyboardInterrupt:
+            except (KeyboardInterrupt, SystemError) as error:
+                if not _is_interrupt(error):
+                    raise
                 raise KeyboardInterrupt(f"interrupted in {stage.name}; earlier stages are kept") from None
             record = self._record(stage, inputs, run_directory.outputs(out), meter, tools, summary)
             self.run.commit(stage.name, out, record)
@@ -252,6 +263,13 @@ class Pipeline:
             "warnings": tools.warnings,
             "n_warnings": tools.n_warnings,
         }
+
+
+def _is_interrupt(error: BaseException | None) -> bool:
+    """Tell whether an error began as Ctrl-C: one that comes while a kernel is looked up reaches us as numba's SystemError."""
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__cause__ or error.__context__
+    return error is not None
 
 
 def _plain(value: Any) -> Any:

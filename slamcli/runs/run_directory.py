@@ -8,6 +8,7 @@ import fcntl
 import json
 import logging
 import os
+import shlex
 import shutil
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -55,9 +56,11 @@ class RunDir:
 
     @classmethod
     def find(cls, run: str | None) -> "RunDir":
-        """Open the run a command means: `run` (of -r), else $SLAMCLI_RUN, else the one last touched by `slamcli run`."""
+        """Open the run a command means: `run` (of -r), a folder or a name under runs/, else $SLAMCLI_RUN, else the one last touched."""
         named = run or os.environ.get("SLAMCLI_RUN")
         path = Path(named) if named else LATEST
+        if named and not (path / "run.json").is_file() and (RUNS / named / "run.json").is_file():
+            path = RUNS / named
         if (path / "run.json").is_file():
             return cls(path if named else Path(os.path.relpath(path.resolve())))._checked()
         if named:
@@ -103,6 +106,11 @@ class RunDir:
 
     # what belongs to the whole run
 
+    @property
+    def flag(self) -> str:
+        """Return the words that make a command act on this run, for hints that are pasted whole."""
+        return f"-r {shlex.quote(str(self.path))}"
+
     def info(self) -> dict[str, Any]:
         """Read ``run.json``."""
         return read_json(self.path / "run.json")
@@ -125,7 +133,7 @@ class RunDir:
 
         root = self.info()["root"]
         if not Path(root).exists():
-            raise SlamError(f"{root}: the recording is not there any more; put it back, or: slamcli run TARGET -r {self.path}")
+            raise SlamError(f"{root}: the recording is not there any more; put it back, or: slamcli run TARGET {self.flag}")
         config = config or self.config()
         return open_dataset(root, camera=dict(config.camera) or None, options=config.recording)
 
@@ -148,16 +156,18 @@ class RunDir:
         """Name the folder of a finished stage, or a file in it; SlamError says how to make it when it is not there."""
         path = self.path.joinpath(stage, *names)
         if not (self.path / stage / "stage.json").exists():
-            raise SlamError(f"{self.path}: {stage} has not been run; try: slamcli run --until {stage}")
+            raise SlamError(f"{self.path}: {stage} has not been run; try: slamcli run --until {stage} {self.flag}")
         if not path.exists():
-            raise SlamError(f"{path}: not there; make it with: slamcli {stage}")
+            raise SlamError(f"{path}: not there; make it with: slamcli {stage} {self.flag}")
         self._warn_unless_fresh(stage)
         return path
 
     def _warn_unless_fresh(self, stage: str) -> None:
         """Say once that a result is not what the run's configuration would give now."""
         if stage not in self._warned and not (state := self.states()[stage]).is_fresh:
-            log.warning("%s: %s is %s (%s); bring it up to date with: slamcli run", self.path, stage, state.state, state.reason)
+            log.warning(
+                "%s: %s is %s (%s); bring it up to date with: slamcli run %s", self.path, stage, state.state, state.reason, self.flag
+            )
         self._warned.add(stage)
 
     def states(

@@ -9,14 +9,14 @@ from slamcli.stages import NAMES
 
 MADE = (  # name, stage, what its summary says of it, where it is
     ("cloud", "densify", "{points} points", "densify/cloud.ply"),
-    ("octree", "octree", "{occupied_cells} occupied and {free_cells} free cells", "octree/map.ot, octree/map.bt"),
-    ("grid", "grid2d", "{columns} x {rows} cells, {occupied} occupied, {free} free", "grid2d/map.pgm, grid2d/map.yaml"),
+    ("octree", "octree", "{occupied_cells} occupied and {free_cells} free cells", "octree/map.ot, map.bt"),
+    ("grid", "grid2d", "{columns} x {rows} cells, {occupied} occupied, {free} free", "grid2d/map.pgm, map.yaml"),
 )
 
 
 def outcome(run: RunDir) -> str:
-    """Tabulate what was made and where it is, then the commands that come next; "" while a stage is missing."""
-    records = {name: record for name in NAMES if (record := run.record(name)) is not None}
+    """Tabulate what was made and where it is; "" while a stage is missing."""
+    records = _records(run)
     if len(records) < len(NAMES):
         return ""
     n_warnings = sum(record["n_warnings"] for record in records.values())
@@ -26,16 +26,25 @@ def outcome(run: RunDir) -> str:
         _cost(records),
         *([["warnings", str(n_warnings), "log.txt"]] if n_warnings else []),
     ]
-    return f"{table(rows)}\nnext: " + "; ".join(_next(run))
+    return table(rows)
+
+
+def to_dict(run: RunDir) -> dict[str, Any]:
+    """Return what `outcome` tells, as plain values: by stage its counts, time and warnings."""
+    names = ("seconds", "cpu_seconds", "peak_rss_mb", "digest", "summary", "warnings")
+    stages = {stage: {name: record[name] for name in names} for stage, record in _records(run).items()}
+    return {"run": str(run.path), "recording": run.info()["root"], "stages": stages}
+
+
+def _records(run: RunDir) -> dict[str, Any]:
+    return {name: record for name in NAMES if (record := run.record(name)) is not None}
 
 
 def _trajectory(records: dict[str, Any]) -> list[str]:
     n_frames, loop = records["extract"]["summary"]["frames"], records["loop"]["summary"]
-    return [
-        "trajectory",
-        f"{n_frames - loop['lost']} of {n_frames} frames, {loop['closures']} loop{'s' * (loop['closures'] != 1)} closed",
-        "loop/trajectory.txt",
-    ]
+    apart = loop.get("apart", 0)
+    told = f"{n_frames - loop['lost'] - apart} of {n_frames} frames, {loop['closures']} loop{'s' * (loop['closures'] != 1)} closed"
+    return ["trajectory", f"{told}, {apart} frames in segments apart" if apart else told, "loop/trajectory.txt"]
 
 
 def _cost(records: dict[str, Any]) -> list[str]:
@@ -44,11 +53,13 @@ def _cost(records: dict[str, Any]) -> list[str]:
     return ["cost", f"{seconds:.1f} s, {n_frames / max(seconds, 1e-3):.1f} frames/s, {peak:.0f} MiB"]
 
 
-def _next(run: RunDir) -> list[str]:
+def next_commands(run: RunDir) -> list[str]:
+    """List the commands that come next for this run, each to be pasted as it is."""
     has_truth = (Path(run.info()["root"]) / "groundtruth.txt").is_file()
+    which = run.flag
     return [
-        *(["slamcli eval ape"] if has_truth else []),
-        "slamcli report",
-        "slamcli export-grid map.pgm --png map.png",
-        "slamcli plan --start X,Y --goal X,Y",
+        *([f"slamcli eval ape {which}"] if has_truth else []),
+        f"slamcli report {which}",
+        f"slamcli export-grid map.pgm --png map.png {which}",
+        f"slamcli plan --start first --goal last {which}",
     ]

@@ -33,5 +33,5 @@ def frame_features(features: Features, frame: int, camera: Camera, sensor: Senso
 
 def refine_on_landmarks(T_cw: np.ndarray, x_w: np.ndarray, frame: FrameFeatures, rows: np.ndarray, camera: Camera) -> PoseEstimate:
     """Refine a frame's pose on landmarks `x_w` (N, 3) [m, world] seen as its features `rows` (N,)."""
-    measured = (values.take(rows, axis=0) for values in (frame.xy, frame.depth, frame.sigma_px, frame.sigma_z))
-    return camera_pose.refine_pose(T_cw, x_w, *measured, camera)
+    xy, depth, sigma_px, sigma_z = (values.take(rows, axis=0) for values in (frame.xy, frame.depth, frame.sigma_px, frame.sigma_z))
+    return camera_pose.refine_pose(T_cw, x_w, xy, depth, sigma_px, sigma_z, camera)

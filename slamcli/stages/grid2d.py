@@ -9,8 +9,10 @@ from slamcli.artifacts import save
 from slamcli.config.options import Config
 from slamcli.formats import grid_map, octomap
 from slamcli.navigation import grid
+from slamcli.navigation.driven import mark_driven
 from slamcli.navigation.grid_evidence import View, look
-from slamcli.schema import Features, Grid, Ground
+from slamcli.navigation.robot_pose import planar_pose
+from slamcli.schema import Features, Grid, Ground, Map, Tracks, frame_poses
 from slamcli.stages.contract import Inputs, Summary, Tools
 from slamcli.stages.depth_frames import depth_poses, read_depth
 
@@ -28,11 +30,15 @@ def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
         made = grid_from_octree(octomap.read(inputs.path("octree", "map.ot")), settings=cfg.grid2d)
     else:
         made, summary["views"] = _from_depth(inputs, ground.T_lw, cfg, tools)
+    T_lc = ground.T_lw @ frame_poses(inputs.load(Tracks, "loop"), inputs.load(Map, "loop"))
+    made = mark_driven(made, T_lc[:, :2, 3], settings=cfg.grid2d)
     counts = {name: int((made.state == state).sum()) for name, state in (("occupied", grid.OCCUPIED), ("free", grid.FREE))}
     if not counts["free"]:
         tools.warn("the grid has no free cell: the floor was not seen")
     save(made, out)
-    grid_map.write(out / "map.pgm", grid_map.GridMap(made.state, (float(made.origin[0]), float(made.origin[1])), float(made.resolution)))
+    has_pose = np.isfinite(T_lc[:, 0, 0])
+    start = planar_pose(T_lc[has_pose][0]) if has_pose.any() else None
+    grid_map.write(out / "map.pgm", grid_map.GridMap.of(made), start=start)
     rows, columns = made.state.shape
     return {**summary, "columns": columns, "rows": rows, **counts, "floor": bool(ground.is_found)}
 

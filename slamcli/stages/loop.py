@@ -13,7 +13,7 @@ from slamcli.config.options import Config
 from slamcli.errors import SlamError
 from slamcli.formats.g2o import write_g2o
 from slamcli.geometry.camera import Camera
-from slamcli.schema import LOST, Closures, CoarseDepth, Features, Map, Timing, Tracks, Words
+from slamcli.schema import LOST, Closures, CoarseDepth, Features, Map, Timing, Tracks, Words, frame_segments
 from slamcli.slam import final_refinement, loop_closing, map_merging, map_segments
 from slamcli.slam.depth_tracking import Reliefs
 from slamcli.slam.loop_closing import Candidate
@@ -64,6 +64,7 @@ def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
         "closures": len(accepted),
         "segments": map_segments.n_segments(map_),
         "lost": int((tracks.state == LOST).sum()),
+        "apart": int((frame_segments(tracks, map_) > 0).sum()),
         "landmarks": len(map_.lm_xyz),
     }
 

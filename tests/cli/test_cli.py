@@ -55,7 +55,7 @@ def test_run_makes_a_run_named_after_the_recording_and_prints_where(fake: Path, 
     result = slamcli("run", "recordings/desk")
     assert (result.exit_code, result.stdout) == (0, "runs/desk\n")
     made = ["trajectory", "cloud", "octree", "grid", "cost", "warnings"]
-    assert [line.split()[0] for line in result.stderr.splitlines()] == ["Warning:", *NAMES, *made, "next:"]
+    assert [line.split()[0] for line in result.stderr.splitlines()] == ["desk", "Warning:", *NAMES, *made, "map", "next:", *["slamcli"] * 2]
     assert "extract: rgb.txt: 2 repeated stamps" in result.stderr
     assert "3 frames" in result.stderr
     assert os.readlink("runs/latest") == "desk"
@@ -66,9 +66,24 @@ def test_a_finished_run_tells_what_it_made_and_what_comes_next(fake: Path, slamc
     told = slamcli("run", "recordings/desk").stderr
     for text in ("2 of 3 frames, 2 loops closed", "500 points", "60 occupied and 70 free cells", "8 x 9 cells", "grid2d/map.pgm"):
         assert text in told
-    assert "next: slamcli report; " in told  # without a true trajectory there is nothing to evaluate
+    assert "next: slamcli report -r runs/desk\n" in told  # without a true trajectory there is nothing to evaluate
     (fake / "recordings" / "desk" / "groundtruth.txt").write_text("")
-    assert "next: slamcli eval ape; slamcli report" in slamcli("run").stderr
+    assert "next: slamcli eval ape -r runs/desk\n      slamcli report -r runs/desk\n" in slamcli("run").stderr
+
+
+def test_what_a_run_made_as_json(fake: Path, slamcli: Slamcli) -> None:
+    made = json.loads(slamcli("run", "recordings/desk", "--json").stdout)
+    assert made["run"] == "runs/desk"
+    assert list(made["stages"]) == list(NAMES)
+    assert made["stages"]["loop"]["summary"]["closures"] == 2
+    assert made["map"] is None  # the fake stages make no map
+    assert json.loads(slamcli("run", "recordings/desk", "--until", "track", "--json").stdout)["next"][0].endswith("-r runs/desk")
+
+
+def test_quiet_tells_nothing_but_warnings_and_where_the_run_is(fake: Path, slamcli: Slamcli) -> None:
+    result = slamcli("run", "recordings/desk", "--quiet")
+    assert result.stdout == "runs/desk\n"
+    assert result.stderr == "Warning: extract: rgb.txt: 2 repeated stamps\n"
 
 
 def test_a_run_that_stops_on_the_way_tells_no_outcome(fake: Path, slamcli: Slamcli) -> None:
@@ -178,6 +193,18 @@ def test_what_ends_a_stage_early_is_told_in_a_line_and_keeps_what_was_done(
     assert states(slamcli) == {"extract": "up to date", **dict.fromkeys(NAMES[1:], "missing")}
 
 
+def test_ctrl_c_that_numba_turned_into_another_error_is_still_ctrl_c(fake: Path, slamcli: Slamcli, monkeypatch: pytest.MonkeyPatch) -> None:
+    error = SystemError("CPUDispatcher returned a result with an exception set")
+    error.__cause__ = KeyboardInterrupt()
+    fail_with(error, monkeypatch)
+    result = slamcli("run", "recordings/desk")
+    assert result.exit_code == 130
+    assert result.stderr.splitlines()[-1] == "Error: interrupted in match; earlier stages are kept"
+    fail_with(SystemError("a bug of its own"), monkeypatch)
+    with pytest.raises(SystemError):
+        slamcli("run", "recordings/desk")
+
+
 def test_a_bug_keeps_its_traceback(fake: Path, slamcli: Slamcli, monkeypatch: pytest.MonkeyPatch) -> None:
     fail_with(ZeroDivisionError("a bug"), monkeypatch)
     with pytest.raises(ZeroDivisionError):
@@ -235,7 +262,7 @@ def test_a_stage_command_names_what_is_missing(fake: Path, slamcli: Slamcli) -> 
     slamcli("run", "recordings/desk", "--until", "match")
     result = slamcli("loop")
     assert result.exit_code == 1
-    assert result.stderr == "Error: loop needs optimize, which has not been run; try: slamcli run --until optimize\n"
+    assert result.stderr == "Error: loop needs optimize, which has not been run; try: slamcli run --until optimize -r runs/desk\n"
 
 
 # status

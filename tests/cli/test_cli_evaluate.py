@@ -16,7 +16,7 @@ from click.testing import Result
 from slamcli.evaluation import trajectory_error
 from slamcli.formats.trajectory import read_tum, write_tum
 from slamcli.runs.run_directory import RunDir
-from slamcli.schema import Ground
+from slamcli.schema import Ground, Trajectory
 
 Command = Callable[..., Result]
 
@@ -169,3 +169,51 @@ def test_map_needs_an_octree(slamcli: Command, made: finished.Finished) -> None:
     result = slamcli("eval", "map", "-r", made.run)
     assert result.exit_code == 1
     assert "octree has not been run" in result.stderr
+
+
+def test_export_trajectory_refuses_an_ending_that_promises_something_else(slamcli, made, tmp_path):
+    result = slamcli("export-trajectory", tmp_path / "t.json", "-r", made.run)
+    assert result.exit_code == 1
+    assert "t.json: the name must end in .txt" in result.stderr
+    assert not (tmp_path / "t.json").exists()
+
+
+def test_the_base_of_a_robot_moves_rigidly_with_its_camera(slamcli, made, tmp_path):
+    for name, more in (("camera.txt", ()), ("base.txt", ("--mount", "0.1,0.2,0.3,0,0.2,0.5"))):
+        assert slamcli("export-trajectory", tmp_path / name, "-r", made.run, *more).exit_code == 0
+    camera, base = read_tum(tmp_path / "camera.txt").T_wc, read_tum(tmp_path / "base.txt").T_wc
+    T_cb = np.linalg.inv(camera) @ base
+    np.testing.assert_allclose(T_cb, np.broadcast_to(T_cb[0], T_cb.shape), atol=1e-7)
+    assert np.linalg.norm(T_cb[0, :3, 3]) == pytest.approx(np.linalg.norm([0.1, 0.2, 0.3]), abs=1e-7)
+
+
+def test_a_trajectory_can_be_exported_after_extract_was_cleared_away(slamcli, tmp_path):
+    made = finished.make(tmp_path, frames=30, n_lost=2)
+    assert slamcli("export-trajectory", tmp_path / "before.txt", "-r", made.run).exit_code == 0
+    shutil.rmtree(made.run / "extract")
+    result = slamcli("export-trajectory", tmp_path / "after.txt", "-r", made.run, "--json")
+    assert json.loads(result.stdout) == {"out": str(tmp_path / "after.txt"), "poses": 28, "frames": 30, "frame": "world", "format": "tum"}
+    np.testing.assert_allclose(read_tum(tmp_path / "after.txt").T_wc, read_tum(tmp_path / "before.txt").T_wc, atol=2e-9)
+
+
+def test_a_true_trajectory_of_another_clock(slamcli, made, tmp_path):
+    stamp = made.truth.stamp - 7.25
+    write_tum(tmp_path / "mocap.txt", Trajectory(stamp=stamp, T_wc=made.truth.T_wc))
+    given = ("eval", "ape", "-r", made.run, "--json", "--truth", tmp_path / "mocap.txt")
+    assert slamcli(*given).exit_code == 1  # no pose within 0.02 s
+    moved = json.loads(slamcli(*given, "--truth-offset", "7.25").stdout)
+    assert moved["rmse"] == pytest.approx(json.loads(slamcli("eval", "ape", "-r", made.run, "--json").stdout)["rmse"], abs=1e-6)
+
+
+def test_json_is_a_list_whenever_several_were_asked_for(slamcli, made):
+    assert isinstance(json.loads(slamcli("eval", "ape", "-r", made.run, "--json").stdout), dict)
+    assert isinstance(json.loads(slamcli("eval", "ape", "-r", made.run, "--json", "--stage", "all").stdout), list)
+    assert isinstance(json.loads(slamcli("eval", "rpe", made.run, made.run, "--json").stdout), list)
+
+
+def test_a_run_may_be_called_by_its_name_under_runs(slamcli, here):
+    made = finished.make(here, frames=30, n_lost=0)
+    (here / "runs").mkdir()
+    shutil.move(made.run, here / "runs" / "mine")
+    assert json.loads(slamcli("eval", "ape", "mine", "--json").stdout)["n_frames"] == 30
+    assert slamcli("status", "-r", "mine").exit_code == 0

@@ -13,7 +13,7 @@ from slamcli.config.options import Config, GridConfig
 from slamcli.errors import BadFrame
 from slamcli.formats import grid_map, octomap
 from slamcli.geometry import se3
-from slamcli.runs import pipeline
+from slamcli.runs import pipeline, placement
 from slamcli.runs.run_directory import RunDir
 from slamcli.schema import Features, Grid, Ground, Map, Timing, Tracks
 from slamcli.stages import grid2d, stage_named
@@ -50,6 +50,19 @@ def test_export_grid_writes_map_page_and_picture(run, here, slamcli):
     picture = cv2.imread(str(here / "map.png"))
     assert min(picture.shape[:2]) > 300
     assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 5  # cells, trajectory, legend
+
+
+def test_the_page_tells_where_the_recording_began_and_with_a_mount_where_the_base_did(run, here, slamcli):
+    about = json.loads(slamcli("export-grid", "map.pgm", "-r", run, "--json").stdout)
+    folder = RunDir(run)
+    T_lc = folder.load(Ground, "densify").T_lw @ placement.camera_poses(folder)[0]
+    assert [about["start"]["x"], about["start"]["y"]] == pytest.approx(T_lc[:2, 3])
+    first = (here / "map.yaml").read_text().splitlines()[0]
+    assert first.startswith(f"# start: x {T_lc[0, 3]:.4f}")
+    assert grid_map.read(here / "map.yaml").origin == (-1.0, -0.5)  # a comment, no more
+    moved = json.loads(slamcli("export-grid", "map.pgm", "-r", run, "--json", "--mount", "0,0,0.2,0,0,0").stdout)["start"]
+    assert moved != about["start"]
+    assert slamcli("export-grid", "map.pgm", "-r", run, "--mount", "1,2,3").exit_code == 2
 
 
 @pytest.mark.parametrize("name", ["map.png", "map", "map.PGM.txt"])
@@ -92,6 +105,21 @@ def test_plan_as_json_and_into_files(run, here, slamcli):
 def test_plan_draws_into_the_run_by_default(run, here, slamcli):
     assert slamcli("plan", "--start", "0,0.5", "--goal", "1,0.5", "-r", run).exit_code == 0
     assert (run / "plan.png").stat().st_size > 1000
+
+
+def test_plan_between_where_the_camera_began_and_ended(run, here, slamcli):
+    result = slamcli("plan", "--start", "first", "--goal", "last", "-r", run, "--png", "p.png", "--json")
+    assert result.exit_code == 0, result.stderr
+    about = json.loads(result.stdout)
+    assert about["start"] == pytest.approx(about["points"][0], abs=1e-3)
+    assert about["length"] > 0.0
+
+
+def test_a_map_file_does_not_tell_where_the_camera_was(run, here, slamcli):
+    slamcli("export-grid", "map.pgm", "-r", run)
+    result = slamcli("plan", "--map", "map.yaml", "--start", "first", "--goal", "1,1")
+    assert result.exit_code == 1
+    assert "does not tell where a camera was" in result.stderr
 
 
 def test_plan_on_a_map_of_someone_else(run, here, slamcli):

@@ -9,6 +9,7 @@ from hypothesis.extra.numpy import array_shapes, arrays
 from slamcli.errors import SlamError
 from slamcli.formats import grid_map
 from slamcli.formats.grid_map import GridMap
+from slamcli.schema import Grid
 
 
 def load_as_map_server(page, *, free_thresh=None):
@@ -147,3 +148,19 @@ def test_other_names_and_places_are_refused(tmp_path):
         grid_map.write(tmp_path / "map.png", some)
     with pytest.raises(SlamError, match="cannot be written"):
         grid_map.write(tmp_path / "nowhere" / "map.pgm", some)
+
+
+def test_a_grids_numbers_are_written_without_the_tails_of_sums(tmp_path):
+    """23 cells of 0.05 m make 1.1500000000000001 m."""
+    origin = np.array([-23, -1]) * 0.05
+    assert repr(float(origin[0])) == "-1.1500000000000001"
+    grid = Grid(np.zeros((2, 2), np.float32), np.ones((2, 2), np.int32), np.zeros((2, 2), np.int8), origin, np.array(0.05))
+    _, page = grid_map.write(tmp_path / "map.pgm", GridMap.of(grid))
+    assert "resolution: 0.05\norigin: [-1.15, -0.05, 0.0]\n" in page.read_text()
+
+
+def test_where_the_recording_began_is_a_comment(tmp_path):
+    grid = GridMap(np.zeros((2, 2), np.int8), (0.0, 0.0), 0.05)
+    _, page = grid_map.write(tmp_path / "map.pgm", grid, start=(-1e-17, 0.25, -1.5))
+    assert page.read_text().startswith("# start: x 0.0, y 0.25, yaw -1.5 [m, m, rad]")
+    assert grid_map.read(page).resolution == 0.05

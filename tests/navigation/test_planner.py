@@ -168,3 +168,34 @@ def test_distance_to_obstacles_is_never_overstated():
         exact = np.hypot(dx, dy).min() * RESOLUTION
         assert distance[i, j] <= exact + 1e-6
         assert distance[i, j] >= exact - 0.5 * RESOLUTION
+
+
+def islands() -> Grid:
+    """Two free regions, 2 m x 2 m and 1 m x 1 m, in the unknown."""
+    state = np.full((60, 100), -1, np.int8)
+    state[10:50, 10:50] = 0
+    state[20:40, 70:90] = 0
+    return Grid(np.zeros(state.shape, np.float32), np.ones(state.shape, np.int32), state, origin=np.zeros(2), resolution=np.array(0.05))
+
+
+def test_a_place_without_room_is_moved_to_the_nearest_that_has_it() -> None:
+    grid = islands()
+    ((x, y),) = planner.nearest_room(grid, [(0.1, 1.5)], radius=0.2, allow_unknown=False)
+    margin = planner.obstacle_distance(grid, allow_unknown=False)
+    assert margin[int(y / 0.05), int(x / 0.05)] >= 0.2
+    assert y == pytest.approx(1.5, abs=0.05)
+    assert 0.5 + 0.2 <= x < 0.5 + 0.3
+
+
+def test_both_ends_come_to_lie_in_one_region() -> None:
+    places = [(0.1, 1.5), (3.4, 1.5)]
+    found = planner.nearest_room(islands(), places, radius=0.2, allow_unknown=False)
+    assert planner.plan(islands(), *found, radius=0.2).length > 0.5
+    assert all(x < 2.5 for x, _ in found)
+    fixed = planner.nearest_room(islands(), places[:1], radius=0.2, allow_unknown=False, fixed=[(4.0, 1.5)])
+    assert fixed[0][0] > 3.5
+
+
+def test_a_robot_too_large_for_every_region() -> None:
+    with pytest.raises(SlamError, match="fits nowhere"):
+        planner.nearest_room(islands(), [(1.0, 1.0)], radius=1.5, allow_unknown=False)

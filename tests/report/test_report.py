@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from click.testing import Result
 
+from slamcli.evaluation import map_verdict
 from slamcli.evaluation.run_content import collect
 from slamcli.report import doubts, make, pictures
 from slamcli.runs.run_directory import RunDir
@@ -150,6 +151,34 @@ def test_frames_of_other_map_segments_are_told_of(made: finished.Finished) -> No
     texts = " ".join(remark.text for remark in doubts.remarks(dataclasses.replace(content, T_lc=T_lc)))
     assert f"7 of {len(T_lc)} frames belong to map segments that could not be joined" in texts
     assert "belong to map segments" not in " ".join(remark.text for remark in doubts.remarks(content))
+
+
+def test_findings_on_the_recording_are_on_the_page_and_looked_for_once(slamcli: Command, tmp_path: Path) -> None:
+    made = finished.make(tmp_path, frames=30, n_lost=0)
+    assert "have no reading" not in page_of(slamcli, made.run, tmp_path / "report.html").text
+    kept = json.loads((made.run / "inspection.json").read_text())
+    kept["findings"] = [{"level": "error", "check": "holes", "message": "no <depth> at all", "advice": "look at the lens"}]
+    (made.run / "inspection.json").write_text(json.dumps(kept))
+    assert "Recording: no <depth> at all: look at the lens" in page_of(slamcli, made.run, tmp_path / "report.html").text
+    (made.run / "inspection.json").write_text(json.dumps({**kept, "digest": "of another recording"}))
+    assert "no <depth> at all" not in page_of(slamcli, made.run, tmp_path / "report.html").text
+    assert slamcli("report", "-r", made.run, "--no-inspect").exit_code == 0
+
+
+def test_a_page_that_cannot_be_written_names_the_users_file(slamcli: Command, made: finished.Finished, tmp_path: Path) -> None:
+    result = slamcli("report", "-r", made.run, "--no-inspect", "-o", tmp_path / "nowhere" / "page.html")
+    assert result.exit_code == 1
+    assert f"{tmp_path / 'nowhere' / 'page.html'}: cannot be written" in result.stderr
+
+
+def test_a_map_of_no_use_is_told_in_amber_with_the_cause(made: finished.Finished, room_run: Path) -> None:
+    content = collect(RunDir.find(str(room_run)))
+    assert content.verdict is not None
+    first = doubts.remarks(content)
+    assert any(r.kind == doubts.NOTE and r.text.startswith("A robot could not use this map: floor seen in 0 of 40 views") for r in first)
+    good = map_verdict.judge(dataclasses.replace(content.verdict.evidence, is_floor_found=True, views_with_floor=30, free_area=9.0, path_known=0.9), max_range=4.0)  # fmt: skip
+    told = doubts.remarks(dataclasses.replace(content, verdict=good))
+    assert any(r.kind == doubts.GOOD and r.text.startswith("A robot can use the map: 9.0 m2 of free floor") for r in told)
 
 
 def test_example_route_stays_in_the_largest_free_region() -> None:

@@ -6,8 +6,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from slamcli.datasets import png
 from slamcli.datasets.calibration import Calibration
-from slamcli.datasets.images import JPEG_MAGIC, PNG_MAGIC
+from slamcli.datasets.images import JPEG_MAGIC
 from slamcli.datasets.intrinsics import COEFFICIENTS
 from slamcli.datasets.recorded import Recorded, Stream, truth_of_rows
 from slamcli.datasets.sqlite import Blobs, query
@@ -69,12 +70,12 @@ def decode_depth(data: bytes, name: str) -> bytes | np.ndarray:
             return rvl.decode(data[16:], *struct.unpack("<II", data[8:16]))
         except SlamError as error:
             raise BadFrame(f"{name}: {error}") from error
-    if data.startswith(PNG_MAGIC) and len(data) > 26 and data[25] == 6:  # RGBA: four bytes of a float
+    if data.startswith(png.MAGIC) and len(data) > 26 and data[25] == 6:  # RGBA: four bytes of a float
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
         if image is None or image.ndim != 3 or image.shape[2] != 4 or image.dtype != np.uint8:
             raise BadFrame(f"{name}: is damaged")
         return np.ascontiguousarray(image).view(np.float32)[..., 0]
-    if not data.startswith((PNG_MAGIC, JPEG_MAGIC)):
+    if not data.startswith((png.MAGIC, JPEG_MAGIC)):
         raise BadFrame(f"{name}: is of a kind that is not known")
     return data
 

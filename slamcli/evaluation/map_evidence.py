@@ -1,0 +1,164 @@
+"""What a map's usefulness to a robot rests on, measured: floor seen, depth missing, walls alone in view, surfaces that lie twice in the map.
+
+Everything is in the level frame (z up, floor at z = 0). A view is what one frame's coarse depth image shows, as oriented points.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from slamcli.depth import noise_model
+from slamcli.depth.icp import CLEANING, Relief
+from slamcli.geometry import se3
+from slamcli.schema import Grid
+
+MOST_VIEWS = 60  # looked at, evenly spread; every pair of them is compared
+FLOOR_BAND = 0.06  # [m] a point of the floor is at most this high or low, twice the noise of its depth added
+UPWARD = 0.9  # cosine: the normal of a floor point from the vertical
+LEAST_FLOOR = 0.01  # share of a view's pixels that show floor, or the view has not seen it
+SAMPLED = 16  # every so many points of a view are compared with other views
+SAME_SURFACE = 0.9  # cosine between the normals of two points of one surface
+THICKNESS = 0.03  # [m] two points of one surface lie within this, three sigma of both readings added
+FARTHEST_TWIN = 0.6  # [m] from a surface to its double; what is farther apart is two things
+LEAST_TWIN = 0.02  # share of a view's pixels in which another shows a surface standing in free space
+FLAT = 0.04  # [m] points of a flat wall lie within this of a plane, twice the noise added
+PATH_SQUARE = 0.5  # [m] about a robot's width
+UPRIGHT = 0.5  # cosine of a wall's normal to the vertical at most
+
+
+@dataclass(frozen=True)
+class View:
+    """What one frame shows, and from where."""
+
+    T_lc: np.ndarray  # (4, 4) camera to level frame
+    relief: Relief  # its surface, in the camera's frame
+    missing: float  # share of the pixels without a reading
+
+    @property
+    def xyz_l(self) -> np.ndarray:
+        """Return the points (N, 3) in the level frame [m]."""
+        return se3.transform(self.T_lc, self.relief.xyz.astype(np.float64))
+
+    @property
+    def normal_l(self) -> np.ndarray:
+        """Return the normals (N, 3) in the level frame."""
+        return self.relief.normal @ self.T_lc[:3, :3].T
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """The figures a verdict rests on."""
+
+    free_area: float  # [m^2] of free cells
+    path_area: float  # [m^2] of the squares of PATH_SQUARE that the camera crossed: what a robot that drove there has under it
+    path_known: float  # share of the frames whose camera stands over a cell that is free or occupied
+    is_floor_found: bool
+    views: int  # looked at
+    views_with_floor: int
+    views_of_a_wall: int  # that show one flat wall and nothing else
+    missing: float  # share of the depth images' pixels without a reading, median
+    views_doubled: int  # in whose free space another view puts the very surface that they see behind it
+    doubled_by: float  # [m] from a surface to its double, median; NaN where there is none
+    camera_height: float  # [m] above the floor, median; NaN without a floor
+    camera_pitch_deg: float  # [degrees] by which the camera looks down, median
+
+
+def measure(grid: Grid, T_lc: np.ndarray, views: Sequence[View], *, is_floor_found: bool, max_range: float) -> Evidence:
+    """Measure what a map is worth to a robot.
+
+    T_lc : (F, 4, 4) camera to level frame of every frame, NaN = lost
+    views : of frames spread over the recording
+    max_range : [m] to which the grid uses depth: floor farther away is not seen
+    """
+    T_lc = T_lc[np.isfinite(T_lc[:, 0, 0])]
+    twins = [twin for twin in (twin_distance(view, views) for view in views) if np.isfinite(twin)]
+    return Evidence(
+        free_area=float((grid.state == 0).sum() * grid.resolution**2),
+        path_area=len(np.unique(np.floor(T_lc[:, :2, 3] / PATH_SQUARE), axis=0)) * PATH_SQUARE**2,
+        path_known=known_share(grid, T_lc[:, :3, 3]),
+        is_floor_found=is_floor_found,
+        views=len(views),
+        views_with_floor=sum(is_floor_found and sees_floor(view, max_range=max_range) for view in views),
+        views_of_a_wall=sum(is_flat_wall(view) for view in views),
+        missing=float(np.median([view.missing for view in views])) if views else 1.0,
+        views_doubled=len(twins),
+        doubled_by=float(np.median(twins)) if twins else np.nan,
+        camera_height=float(np.median(T_lc[:, 2, 3])) if is_floor_found and len(T_lc) else np.nan,
+        camera_pitch_deg=float(np.degrees(np.median(np.arcsin(np.clip(-T_lc[:, 2, 2], -1, 1))))) if len(T_lc) else np.nan,
+    )
+
+
+def known_share(grid: Grid, xyz_l: np.ndarray) -> float:
+    """Return the share of the places (N, 3) [m] that lie over a cell whose state is known."""
+    if not len(xyz_l):
+        return 0.0
+    column, row = np.floor((xyz_l[:, :2] - grid.origin) / grid.resolution).astype(np.int64).T
+    inside = (row >= 0) & (column >= 0) & (row < grid.state.shape[0]) & (column < grid.state.shape[1])
+    return float((grid.state[row[inside], column[inside]] >= 0).sum() / len(xyz_l))
+
+
+def sees_floor(view: View, *, max_range: float) -> bool:
+    """Tell whether a view shows enough of the floor, within `max_range` [m] of the camera, for the grid to learn from it."""
+    sigma = noise_model.depth_sigma(view.relief.xyz[:, 2], base=CLEANING.noise_base, quadratic=CLEANING.noise_quadratic)
+    is_floor = (np.abs(view.xyz_l[:, 2]) < FLOOR_BAND + 2.0 * sigma) & (view.normal_l[:, 2] > UPWARD) & (view.relief.xyz[:, 2] < max_range)
+    return bool(is_floor.sum() >= LEAST_FLOOR * view.relief.row.size)
+
+
+def is_flat_wall(view: View, *, least: float = 0.9) -> bool:
+    """Tell whether one upright plane holds at least the share `least` of what a view shows."""
+    xyz, normal = view.xyz_l[::SAMPLED], view.normal_l[::SAMPLED]
+    sigma = 2.0 * noise_model.depth_sigma(view.relief.xyz[::SAMPLED, 2], base=CLEANING.noise_base, quadratic=CLEANING.noise_quadratic)
+    if len(xyz) < 10:
+        return False
+    on_plane = np.ones(len(xyz), dtype=bool)
+    for _ in range(4):
+        middle, n = np.median(xyz[on_plane], axis=0), normal[on_plane].mean(axis=0)
+        n /= max(np.linalg.norm(n), 1e-9)
+        on_plane = np.abs((xyz - middle) @ n) < FLAT + sigma
+        if on_plane.sum() < 10:
+            return False
+    return bool(on_plane.mean() >= least and abs(n[2]) < UPRIGHT)
+
+
+def twin_distance(view: View, others: Sequence[View]) -> float:
+    """Return how far in front of a surface some other view puts that same surface [m]; NaN where all agree with what the view sees.
+
+    A view looks through the space between the camera and the surface it sees: where another view has a surface of the same direction
+    there, most of what both show, one of the two lies in the wrong place.
+    """
+    found = np.nan
+    for other in others:
+        agree, in_front = compare(other, view)
+        if len(in_front) * SAMPLED >= LEAST_TWIN * view.relief.row.size and len(in_front) > agree:
+            found = np.nanmax([found, np.median(in_front)])
+    return float(found)
+
+
+def compare(source: View, target: View) -> tuple[int, np.ndarray]:
+    """Look at a view's points from another one; returns how many lie on the surface seen there, and how far in front the others are [m].
+
+    Counted are points of a surface of the same direction, at most FARTHEST_TWIN in front of that seen.
+    """
+    nothing = 0, np.zeros(0)
+    T_ts = se3.inverse(target.T_lc) @ source.T_lc
+    if T_ts[2, 2] < 0.2 or not len(source.relief) or not len(target.relief):  # they look apart
+        return nothing
+    xyz = se3.transform(T_ts, source.relief.xyz[::SAMPLED].astype(np.float64))
+    normal, z = source.relief.normal[::SAMPLED] @ T_ts[:3, :3].T, xyz[:, 2]
+    fx, fy, cx, cy = target.relief.pinhole
+    with np.errstate(divide="ignore", invalid="ignore"):
+        column, row = np.rint(xyz[:, 0] / z * fx + cx), np.rint(xyz[:, 1] / z * fy + cy)
+    height, width = target.relief.row.shape
+    is_in = (z > 0.1) & (row >= 0) & (column >= 0) & (row < height) & (column < width)
+    if not is_in.any():
+        return nothing
+    met = target.relief.row[row[is_in].astype(np.int64), column[is_in].astype(np.int64)]
+    is_met = met >= 0
+    xyz, normal, met = xyz[is_in][is_met], normal[is_in][is_met], met[is_met]
+    n = target.relief.normal[met]
+    in_front = ((xyz - target.relief.xyz[met]) * n).sum(axis=1)
+    sigma = sum(noise_model.depth_sigma(d, base=CLEANING.noise_base, quadratic=CLEANING.noise_quadratic) for d in (xyz[:, 2], target.relief.xyz[met, 2]))  # fmt: skip
+    is_same = (normal * n).sum(axis=1) > SAME_SURFACE
+    limit = THICKNESS + 3.0 * sigma
+    return int((is_same & (np.abs(in_front) < limit)).sum()), in_front[is_same & (in_front >= limit) & (in_front < FARTHEST_TWIN)]
