@@ -6,6 +6,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from slamcli import files
 from slamcli.errors import SlamError
 
 Record = TypeVar("Record")
@@ -41,7 +42,10 @@ def save(value: Any, folder: Path) -> None:
         path = Path(folder) / f"{spec.name}.npy"
         if path.exists():
             raise ValueError(f"{type(value).__name__}.{spec.name}: {path} is already written by another type")
-        np.save(path, np.asarray(getattr(value, spec.name), order="C"), allow_pickle=False)
+        column = np.asarray(getattr(value, spec.name), order="C")
+        with files.written(path), open(path, "xb") as file:
+            np.lib.format.write_array_header_1_0(file, np.lib.format.header_data_from_array_1_0(column))
+            file.write(column.reshape(-1).view(np.uint8).data)  # numpy's own way hides why a write fails
 
 
 def load(cls: type[Record], folder: Path) -> Record:

@@ -1,49 +1,244 @@
-"""Small files written whole, JSON read with suspicion, and digests."""
+"""Files that appear whole or not at all, files read with suspicion, and digests."""
 
+import errno
+import fcntl
 import hashlib
 import json
 import os
+import secrets
+import stat
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from slamcli.errors import SlamError
 
 LARGEST_JSON = 16 << 20  # bytes; a record is a few kB
+BLOCK = 1 << 20  # bytes digested at a time
+LONGEST_NAME = 200  # bytes of a file name; systems allow 255, and the temporary file's is longer
+MOST_LINKS = 40  # followed, as Linux does
+ADVICE = {
+    errno.ENOSPC: "free some space and give the same command again",
+    errno.EDQUOT: "free some space and give the same command again",
+    errno.EFBIG: "choose another file system, or raise the limit with: ulimit -f",
+    errno.EMFILE: "raise the limit with: ulimit -n 4096",
+    errno.ENFILE: "close other programs and give the same command again",
+    errno.EACCES: "choose a place you may write to",
+    errno.EROFS: "choose a place you may write to",
+}
+SEAL = "sealed"  # key of a sealed JSON object that holds the digest of all others
+
+_known: dict[tuple[int, ...], str] = {}  # digests of files this process has read, by what changes when a file does
 
 
-def sha256(path: Path) -> str:
-    """Digest a file's content."""
-    digest = hashlib.sha256()
-    with open(path, "rb") as file:
-        while block := file.read(1 << 20):
-            digest.update(block)
-    return digest.hexdigest()
+# written whole
 
 
-def write_text(path: Path, text: str) -> None:
-    """Replace a small file at once: a reader, or a power cut, meets the old text or the new."""
-    fresh = path.with_name(f".{path.name}.{os.getpid()}")
+@contextmanager
+def whole(path: str | Path) -> Iterator[BinaryIO]:
+    """Write a file that appears under its name whole or not at all.
+
+    The bytes go to a hidden file beside it, which takes the name when the block ends well and is removed when not; what a killed process
+    left is taken over by the next one that writes the same file. A device or a pipe is written to, never replaced; through a link, the
+    file that it leads to is. SlamError where it cannot be written; what other files raise meanwhile passes.
+    """
+    path = Path(path)
+    with written(path):
+        place = _end_of_links(path)
+        if place is None:
+            with open(path, "wb") as file:
+                yield file
+            return
+        part, file = _open_part(place)
+        try:
+            with file:
+                yield file
+                file.flush()
+                os.fsync(file.fileno())
+                os.replace(part, place)  # while the lock is held: nobody takes the file over for a leftover
+        except BaseException:
+            part.unlink(missing_ok=True)
+            raise
+
+
+def write_text(path: str | Path, text: str) -> None:
+    """Replace a text file at once: a reader, or a power cut, meets the old text or the new."""
+    write_bytes(path, text.encode())
+
+
+def write_bytes(path: str | Path, data: bytes) -> None:
+    """Replace a file at once."""
+    with whole(path) as file:
+        file.write(data)
+
+
+@contextmanager
+def written(path: str | Path) -> Iterator[None]:
+    """Turn an OSError about this file, or about none as a full disk's, into a SlamError that names it and the next step."""
     try:
-        with open(fresh, "w", encoding="utf-8") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(fresh, path)
-    except OSError:
-        fresh.unlink(missing_ok=True)
+        yield
+    except OSError as error:
+        if error.filename is None or error.filename == str(path) or str(error.filename).endswith(".part"):
+            said = "its folder is not there; make it first" if error.errno == errno.ENOENT else told(error)
+            raise SlamError(f"{path}: cannot be written ({said})") from error
         raise
+
+
+def told(error: OSError) -> str:
+    """Say what the system says, and what to do about it."""
+    said = error.strerror or str(error)
+    return f"{said}; {ADVICE[error.errno]}" if error.errno in ADVICE else said
+
+
+def _end_of_links(path: Path) -> Path | None:
+    """Follow links to the regular file, there or to be, that is to be replaced; None for what must be written to where it is.
+
+    The latter are devices, pipes, and whatever a descriptor of a process refers to (/dev/stdout): its owner goes on writing there.
+    """
+    for _ in range(MOST_LINKS):
+        if not path.is_symlink():
+            break
+        folder = path.parent.resolve()
+        if folder == Path("/dev") or folder.is_relative_to("/proc"):
+            return None
+        path = folder / os.readlink(path)
+    else:
+        raise OSError(errno.ELOOP, os.strerror(errno.ELOOP), str(path))
+    try:
+        mode = path.stat().st_mode
+    except FileNotFoundError:
+        return path
+    if stat.S_ISDIR(mode):
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+    if stat.S_ISREG(mode) and not os.access(path, os.W_OK):  # a rename asks the folder alone
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
+    return path if stat.S_ISREG(mode) else None
+
+
+def _open_part(place: Path) -> tuple[Path, BinaryIO]:
+    """Open the temporary file that is to become `place`, empty and locked."""
+    name = place.name if len(os.fsencode(place.name)) <= LONGEST_NAME else hashlib.sha256(os.fsencode(place.name)).hexdigest()[:32]
+    part = place.with_name(f".{name}.part")
+    file = _take(part)
+    if file is None:  # another process is writing the same file just now
+        part = place.with_name(f".{name}.{secrets.token_hex(4)}.part")
+        file = open(part, "xb")  # noqa: SIM115  # the caller closes it
+    if place.exists():
+        os.fchmod(file.fileno(), stat.S_IMODE(place.stat().st_mode))
+    return part, file
+
+
+def _take(part: Path) -> BinaryIO | None:
+    """Open a temporary file for this process alone, emptying what a killed one left; None where it is in use or another user's."""
+    try:
+        file = open(part, "wb", opener=_open_as_it_is)  # noqa: SIM115  # the caller closes it
+    except OSError as error:
+        if error.errno in (errno.ELOOP, errno.ENXIO):  # a link or a pipe is none of ours
+            return None
+        raise
+    found = os.fstat(file.fileno())
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        is_there = os.path.samestat(found, os.lstat(part))  # else its owner has just put it in place
+    except OSError:
+        is_there = False
+    if not is_there or not stat.S_ISREG(found.st_mode) or found.st_uid != os.geteuid() or found.st_nlink != 1:
+        file.close()
+        return None
+    file.truncate(0)
+    return file
+
+
+def _open_as_it_is(path: str, _: int) -> int:
+    return os.open(path, os.O_WRONLY | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC, 0o666)
+
+
+# read with suspicion
+
+
+def read_bytes(path: str | Path, *, limit: int) -> bytes:
+    """Read a regular file of at most `limit` bytes; SlamError for a larger one and for a device or a pipe, which may never end."""
+    with open_regular(path) as file:
+        data = file.read(limit + 1)
+    if len(data) > limit:
+        raise SlamError(f"{path}: larger than {limit} bytes, which no such file is")
+    return data
+
+
+def open_regular(path: str | Path) -> BinaryIO:
+    """Open a file for reading; SlamError where it is no regular one. A pipe without a writer is refused instead of waited for."""
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    except ValueError as error:  # a NUL byte in the name
+        raise SlamError(f"{str(path)!r}: not the name of a file") from error
+    file = os.fdopen(descriptor, "rb") if stat.S_ISREG(os.fstat(descriptor).st_mode) else None
+    if file is None:
+        os.close(descriptor)
+        raise SlamError(f"{path}: not a regular file; a device or a pipe cannot be read here")
+    return file
 
 
 def read_json(path: Path) -> dict[str, Any]:
     """Read a JSON object; SlamError when the file is anything else."""
+    return _parse_json(path, _read_json_text(path))
+
+
+def _read_json_text(path: Path) -> str:
     try:
-        with open(path, encoding="utf-8") as file:
-            text = file.read(LARGEST_JSON + 1)
-        value = json.loads(text) if len(text) <= LARGEST_JSON else None
+        return read_bytes(path, limit=LARGEST_JSON).decode("utf-8")
     except FileNotFoundError:
         raise SlamError(f"{path}: not there") from None
+    except UnicodeDecodeError as error:
+        raise SlamError(f"{path}: not valid JSON") from error
+
+
+def _parse_json(path: Path, text: str) -> dict[str, Any]:
+    try:
+        value = json.loads(text)
     except (ValueError, RecursionError) as error:
         raise SlamError(f"{path}: not valid JSON") from error
     if not isinstance(value, dict):
         raise SlamError(f"{path}: not a JSON object")
     return value
+
+
+# digests
+
+
+def sha256(path: Path) -> str:
+    """Digest a file's content. A file that this process has digested before and that nobody has written to since is not read again."""
+    with open_regular(path) as file:
+        found = os.fstat(file.fileno())
+        key = (found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns, found.st_ctime_ns)
+        if key not in _known:
+            content = hashlib.sha256()
+            while block := file.read(BLOCK):
+                content.update(block)
+            _known[key] = content.hexdigest()
+    return _known[key]
+
+
+def digest(value: Any) -> str:
+    """Digest a JSON value, independent of the order of its keys."""
+    return "sha256:" + hashlib.sha256(json.dumps(value, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+
+
+def write_sealed(path: Path, value: Mapping[str, Any]) -> None:
+    """Write a JSON object together with its digest, so that `read_sealed` notices any change."""
+    write_text(path, _sealed(value))
+
+
+def read_sealed(path: Path) -> dict[str, Any]:
+    """Read what `write_sealed` wrote; SlamError when it is not there or a single bit of it is another."""
+    text = _read_json_text(path)
+    value = _parse_json(path, text)
+    value.pop(SEAL, None)
+    if _sealed(value) != text:
+        raise SlamError(f"{path}: not as slamcli wrote it")
+    return value
+
+
+def _sealed(value: Mapping[str, Any]) -> str:
+    plain = json.loads(json.dumps(value))
+    return json.dumps({**plain, SEAL: digest(plain)}, indent=1) + "\n"

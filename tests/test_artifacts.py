@@ -32,6 +32,14 @@ def ragged(frames: int = 2, rows: int = 5) -> Ragged:
     return Ragged(np.zeros(frames + 1, "i8"), values, np.full(rows, np.nan, "f4"), np.float64(0.1), np.bool_(True))
 
 
+def test_files_are_those_that_numpy_writes(tmp_path: Path) -> None:
+    artifacts.save(ragged(), tmp_path)
+    for spec in dataclasses.fields(Ragged):
+        buffer = io.BytesIO()
+        np.save(buffer, getattr(ragged(), spec.name))
+        assert (tmp_path / f"{spec.name}.npy").read_bytes() == buffer.getvalue()
+
+
 @given(frames=st.integers(0, 5), rows=st.integers(0, 7))
 def test_load_gives_what_save_got(tmp_path_factory: pytest.TempPathFactory, frames: int, rows: int) -> None:
     folder, value = tmp_path_factory.mktemp("record"), ragged(frames, rows)

@@ -40,6 +40,25 @@ mount_option = click.option(
 )
 
 
+class Target(click.Path):
+    """A file that a command is to write: nowhere in a run directory, which holds what the run's own commands put there.
+
+    own : the name under which the command itself puts it into a run directory, where it may be named, too
+    """
+
+    def __init__(self, *, own: str = "") -> None:
+        super().__init__(path_type=Path, dir_okay=False, readable=False)
+        self.own = own
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
+        """Refuse a place in a run directory before any work is done."""
+        from slamcli.runs.run_directory import refuse_inside
+
+        path = Path(super().convert(value, param, ctx))
+        refuse_inside(path, own=self.own)
+        return path
+
+
 def _voice(context: click.Context, parameter: click.Parameter, value: int) -> int:
     """Set how much is told, by what the group and the command were given together."""
     from slamcli import console

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from slamcli.cli.common import json_option, run_option
+from slamcli.cli.common import Target, json_option, run_option
 
 if TYPE_CHECKING:
     import numpy as np
@@ -67,7 +67,7 @@ def _trajectory_options(function: Any) -> Any:
         ),
         click.option("--truth-offset", type=float, default=0.0, metavar="S", help="Added to the stamps of the truth [s]."),
         click.option("--other", multiple=True, metavar="NAME=FILE", help="Another system's trajectory of this recording (TUM format)."),
-        click.option("--plot", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE", help="Draw it (.png, .pdf, .svg)."),
+        click.option("--plot", type=Target(), metavar="FILE", help="Draw it (.png, .pdf, .svg)."),
         click.option("--style", type=click.Choice(["text", "csv", "latex"]), default="text", show_default=True, help="Form of the table."),
         json_option,
     ):
@@ -211,13 +211,14 @@ def _trajectories(folder: RunDir, stage: str | None, other: tuple[str, ...]) -> 
 def _record(folder: RunDir, file: str, figures: dict) -> None:
     """Keep the figures with the run; one that may not be written to is evaluated all the same."""
     from slamcli import files
+    from slamcli.errors import SlamError
 
     target = folder.path / "eval" / file
     try:
         target.parent.mkdir(exist_ok=True)
         files.write_text(target, _json([figures]) + "\n")
-    except OSError as error:
-        click.echo(f"Warning: {target} cannot be written ({error.strerror})", err=True)
+    except (OSError, SlamError) as error:
+        click.echo(f"Warning: {error}", err=True)
 
 
 def _truth(folder: RunDir, file: Path | None, offset: float) -> Trajectory:

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import click
 
-from slamcli.cli.common import check_ending, json_option, mount_option, run_option
+from slamcli.cli.common import Target, check_ending, json_option, mount_option, run_option
 
 
 @click.command("export-trajectory")
-@click.argument("out", type=click.Path(path_type=Path, dir_okay=False))
+@click.argument("out", type=Target())
 @run_option
 @click.option("--stage", type=click.Choice(["track", "optimize", "loop"]), help="Whose trajectory; default: the last there is.")
 @click.option("--frame", type=click.Choice(["world", "level"]), default="world", show_default=True, help="level: z up, floor at z = 0.")

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import click
 
-from slamcli.cli.common import json_option
+from slamcli.cli.common import Target, json_option
 
 
 @click.command("inspect-features", short_help="Draw plain OpenCV ORB beside our features on one frame.")
 @click.argument("recording")
 @click.argument("frame", type=click.IntRange(min=0))
-@click.argument("out", type=click.Path(path_type=Path, dir_okay=False))
+@click.argument("out", type=Target())
 @click.option("--data", metavar="DIR", help="Folder of recordings. [default: $SLAMCLI_DATA, ./data, the user's cache]")
 @click.option("--features", type=click.IntRange(50, 20000), default=1000, show_default=True, help="Key points wanted.")
 @json_option
@@ -24,6 +24,7 @@ def inspect_features(recording: str, frame: int, out: Path, data: str | None, fe
     """
     import cv2
 
+    from slamcli import files
     from slamcli.datasets import open_dataset
     from slamcli.errors import SlamError
     from slamcli.runs.run_directory import RunDir
@@ -40,11 +41,10 @@ def inspect_features(recording: str, frame: int, out: Path, data: str | None, fe
         even = comparison.evenness(points.xy, dataset.camera.width, dataset.camera.height)
         figures[name] = {"points": len(points), "cells_hit": round(even.share, 4), "variance_to_mean": round(even.ratio, 3)}
     try:
-        is_written = cv2.imwrite(str(out), comparison.side_by_side(grey, *found.values()))
+        _, data = cv2.imencode(out.suffix, comparison.side_by_side(grey, *found.values()))
     except cv2.error as error:
         raise SlamError(f"{out}: not a kind of picture that can be written; take .png or .jpg") from error
-    if not is_written:
-        raise SlamError(f"{out}: cannot be written; does the folder exist?")
+    files.write_bytes(out, data.tobytes())
     if as_json:
         click.echo(json.dumps(figures, indent=1))
         return

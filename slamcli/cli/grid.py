@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from slamcli.cli.common import json_option, mount_option, run_option
+from slamcli.cli.common import Target, json_option, mount_option, run_option
 
 if TYPE_CHECKING:
     import numpy as np
@@ -35,11 +35,9 @@ class Place(click.ParamType):
 
 
 @click.command("export-grid")
-@click.argument("out", type=click.Path(path_type=Path, dir_okay=False))
+@click.argument("out", type=Target())
 @run_option
-@click.option(
-    "--png", type=click.Path(path_type=Path, dir_okay=False), help="Also draw a picture with the trajectory, a scale bar and a legend."
-)
+@click.option("--png", type=Target(), help="Also draw a picture with the trajectory, a scale bar and a legend.")
 @mount_option
 @json_option
 def export_grid(out: Path, run: str | None, png: Path | None, mount: tuple[float, ...] | None, as_json: bool) -> None:
@@ -99,8 +97,8 @@ def _start(folder: RunDir, mount: tuple[float, ...] | None) -> tuple[float, floa
 @click.option("--clearance", default=0.3, show_default=True, help="Being nearer to obstacles than this beyond the radius costs [m].")
 @click.option("--weight", default=3.0, show_default=True, help="How much more a metre along an obstacle costs than one in the open.")
 @click.option("--allow-unknown", is_flag=True, help="Drive through cells that were never seen, too.")
-@click.option("-o", "--out", type=click.Path(path_type=Path, dir_okay=False), help="Write the path: .csv or .json.")
-@click.option("--png", type=click.Path(path_type=Path, dir_okay=False), help="Draw the path. [default: plan.png in the run directory]")
+@click.option("-o", "--out", type=Target(), help="Write the path: .csv or .json.")
+@click.option("--png", type=Target(own="plan.png"), help="Draw the path. [default: plan.png in the run directory]")
 @json_option
 def plan(
     start: tuple[float, float] | str, goal: tuple[float, float] | str, run: str | None, page: Path | None, radius: float, clearance: float,
@@ -191,11 +189,12 @@ def _json(route: Route, start: tuple[float, float], goal: tuple[float, float], r
 
 
 def _write(out: Path, texts: dict[str, str]) -> None:
+    from slamcli import files
     from slamcli.errors import SlamError
 
     if out.suffix not in texts:
         raise SlamError(f"{out}: a path is written as .csv or .json")
-    out.write_text(texts[out.suffix], encoding="utf-8")
+    files.write_text(out, texts[out.suffix])
 
 
 def _read_map(page: Path) -> Grid:

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import click
 
-from slamcli.cli.common import json_option
+from slamcli.cli.common import Target, json_option
 
 
 @click.command("localize", short_help="Find a new recording's camera in the map of an old run.")
 @click.argument("run")
 @click.argument("recording")
-@click.option("--out", default="localized.txt", show_default=True, type=click.Path(path_type=Path, dir_okay=False), help="TUM trajectory.")
+@click.option("--out", default="localized.txt", show_default=True, type=Target(), help="TUM trajectory.")
 @click.option("--data", metavar="DIR", help="Folder of recordings. [default: $SLAMCLI_DATA, ./data, the user's cache]")
 @json_option
 def localize(run: str, recording: str, out: Path, data: str | None, as_json: bool) -> None:

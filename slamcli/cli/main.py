@@ -6,7 +6,7 @@ from typing import Any
 
 import click
 
-from slamcli import __version__
+from slamcli import __version__, files
 from slamcli.cli.common import verbose_option
 from slamcli.errors import SlamError
 
@@ -38,13 +38,7 @@ class Group(click.Group):
 
 
 def _told(error: OSError) -> str:
-    place = f"{error.filename}: " if error.filename is not None else ""
-    advice = {
-        errno.ENOSPC: "; free some space and give the same command again",
-        errno.EACCES: "; choose a place you may write to, such as with -r",
-        errno.EROFS: "; choose a place you may write to, such as with -r",
-    }
-    return f"{place}{error.strerror}{advice.get(error.errno or 0, '')}"
+    return f"{error.filename}: {files.told(error)}" if error.filename is not None else files.told(error)
 
 
 @click.group(cls=Group, context_settings={"help_option_names": ["-h", "--help"]})

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from slamcli.cli.common import run_option
+from slamcli.cli.common import Target, run_option
 from slamcli.errors import SlamError
 
 if TYPE_CHECKING:
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from slamcli.runs.run_directory import RunDir
     from slamcli.visualization.render import View
 
-out_argument = click.argument("out", type=click.Path(path_type=Path, dir_okay=False))
+out_argument = click.argument("out", type=Target())
 
 
 @click.command("export-cloud")
@@ -58,6 +58,7 @@ def export_octree(out: Path, run: str | None, colour: bool) -> None:
       slamcli export-octree map.bt
       slamcli export-octree map.ot --colour
     """
+    from slamcli import files
     from slamcli.runs.run_directory import RunDir
 
     suffix, folder = _check_suffix(out, ".bt", ".ot"), RunDir.find(run)
@@ -66,7 +67,8 @@ def export_octree(out: Path, run: str | None, colour: bool) -> None:
             raise SlamError(f"{out}: a .bt file has no room for colours; write a .ot file, or leave out --colour")
         _export_colour_octree(out, folder)
     else:
-        shutil.copyfile(folder.stage_path("octree", f"map{suffix}"), out)
+        with open(folder.stage_path("octree", f"map{suffix}"), "rb") as made, files.whole(out) as file:
+            shutil.copyfileobj(made, file)
     click.echo(f"{out}: {out.stat().st_size} bytes", err=True)
 
 
@@ -137,6 +139,7 @@ def render_command(out: Path, run: str | None, what: str, azimuth: float, elevat
     """
     import cv2
 
+    from slamcli import files
     from slamcli.runs.run_directory import RunDir
     from slamcli.visualization import render
 
@@ -147,7 +150,7 @@ def render_command(out: Path, run: str | None, what: str, azimuth: float, elevat
     done, data = cv2.imencode(out.suffix.lower(), image[..., ::-1])
     if not done:
         raise SlamError(f"{out}: the picture cannot be encoded")
-    out.write_bytes(data.tobytes())
+    files.write_bytes(out, data.tobytes())
     click.echo(f"{out}: {size[0]} x {size[1]} px", err=True)
 
 

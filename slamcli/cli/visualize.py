@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from slamcli.cli.common import json_option, run_option
+from slamcli.cli.common import Target, json_option, run_option
 
 if TYPE_CHECKING:
     from slamcli.inspection import Inspection
@@ -82,7 +82,7 @@ def _facts(facts: dict) -> list[str]:
 
 @click.command(short_help="Write one HTML page about a run.")
 @run_option
-@click.option("-o", "--out", type=click.Path(path_type=Path, dir_okay=False), help="The page. [default: report.html in the run directory]")
+@click.option("-o", "--out", type=Target(own="report.html"), help="The page. [default: report.html in the run directory]")
 @click.option("--inspect/--no-inspect", "with_inspection", default=True, help="Look through the recording for faults, once a recording.")
 def report(run: str | None, out: Path | None, with_inspection: bool) -> None:
     """Write one HTML page about a run: trajectory, errors, maps, timings, warnings, configuration.
@@ -120,9 +120,7 @@ def _findings(folder: RunDir) -> list[tuple[str, str]]:
 
 @click.command(short_help="Show a run in the Rerun viewer.")
 @run_option
-@click.option(
-    "--save", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE", help="Write FILE (.rrd) instead; needs no display."
-)
+@click.option("--save", type=Target(), metavar="FILE", help="Write FILE (.rrd) instead; needs no display.")
 @click.option("--images", default=300, show_default=True, type=click.IntRange(min=0), help="Frames shown with their image, at most.")
 def view(run: str | None, save: Path | None, images: int) -> None:
     """Show a run in the Rerun viewer: images, features, key frames, loops, cloud, octree, grid over time.

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from slamcli.cli.common import json_option
+from slamcli.cli.common import Target, json_option
 
 
 @click.group()
@@ -22,7 +22,7 @@ def vocab() -> None:
 
 
 @vocab.command(short_help="Train a vocabulary on pictures and recordings.")
-@click.argument("out", type=click.Path(path_type=Path, dir_okay=False))
+@click.argument("out", type=Target())
 @click.argument("sources", nargs=-1, required=True)
 @click.option("--branching", type=click.IntRange(2, 20), default=12, show_default=True, help="Children of a node.")
 @click.option("--depth", type=click.IntRange(1, 10), default=4, show_default=True, help="Levels; words are at most branching^depth.")
@@ -72,7 +72,7 @@ def train(
 
 @vocab.command("import", short_help="Read a DBoW2 text file, such as ORBvoc.txt.")
 @click.argument("text", type=click.Path(path_type=Path, dir_okay=False))
-@click.argument("out", type=click.Path(path_type=Path, dir_okay=False), required=False)
+@click.argument("out", type=Target(), required=False)
 def import_(text: Path, out: Path | None) -> None:
     """Read the DBoW2 vocabulary TEXT, such as ORBvoc.txt, and write it to OUT (default: its name with .npz)."""
     from slamcli.formats import dbow2
@@ -86,7 +86,7 @@ def import_(text: Path, out: Path | None) -> None:
 
 
 @vocab.command(short_help="Write a vocabulary as a DBoW2 text file.")
-@click.argument("out", type=click.Path(path_type=Path, dir_okay=False))
+@click.argument("out", type=Target())
 @click.argument("vocabulary_file", metavar="[VOCABULARY]", type=click.Path(path_type=Path, dir_okay=False), required=False)
 def export(out: Path, vocabulary_file: Path | None) -> None:
     """Write VOCABULARY (.npz), or the shipped one, to OUT as text, which ORB-SLAM and DBoW2 read."""

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from slamcli import files
 from slamcli.errors import SlamError
 from slamcli.evaluation.trajectory_error import Ape, Rpe, statistics
 
@@ -107,7 +108,5 @@ def _finish(axis: Any, xlabel: str, ylabel: str, *, from_zero: bool = False) -> 
 
 
 def _save(figure: Any, path: Path) -> None:
-    try:
-        figure.savefig(path, dpi=130)
-    except OSError as error:
-        raise SlamError(f"{path}: cannot be written ({error.strerror or error}); choose another place") from None
+    with files.whole(path) as file:
+        figure.savefig(file, format=Path(path).suffix[1:].lower(), dpi=130)

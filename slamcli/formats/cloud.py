@@ -6,6 +6,7 @@ from typing import BinaryIO, Literal
 
 import numpy as np
 
+from slamcli import files
 from slamcli.errors import SlamError
 
 Points = tuple[np.ndarray, np.ndarray | None, np.ndarray | None]  # xyz (N, 3) float32, rgb (N, 3) uint8, normal (N, 3) float32
@@ -39,7 +40,7 @@ def _by_suffix(path: Path, functions: dict[str, Callable]) -> Callable:
 def write_ply(path: Path, xyz: np.ndarray, rgb: np.ndarray | None = None, normal: np.ndarray | None = None) -> None:
     """Write points as binary little-endian PLY."""
     vertex = _vertices(xyz, rgb, normal)
-    with open(path, "wb") as file:
+    with files.whole(path) as file:
         file.write(_ply_header(vertex, n_faces=None))
         file.write(vertex.tobytes())
 
@@ -51,7 +52,7 @@ def write_ply_mesh(
     vertex = _vertices(xyz, rgb, normal)
     face = np.empty(len(triangle), dtype=[("n", "u1"), ("vertex", "<i4", 3)])
     face["n"], face["vertex"] = 3, triangle
-    with open(path, "wb") as file:
+    with files.whole(path) as file:
         file.write(_ply_header(vertex, n_faces=len(face)))
         file.write(vertex.tobytes())
         file.write(face.tobytes())
@@ -129,7 +130,7 @@ def write_pcd(path: Path, xyz: np.ndarray, rgb: np.ndarray | None = None, normal
         f"FIELDS {' '.join(name for name, _ in columns)}\nSIZE{' 4' * k}\nTYPE{' F' * k}\nCOUNT{' 1' * k}\n"
         f"WIDTH {len(point)}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {len(point)}\nDATA binary\n"
     )
-    with open(path, "wb") as file:
+    with files.whole(path) as file:
         file.write(header.encode())
         file.write(point.tobytes())
 

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from slamcli import files
 from slamcli.errors import SlamError
 
 L1_NORM, TF_IDF = 0, 0
@@ -64,7 +65,7 @@ def write(path: str | Path, tree: Tree) -> None:
         tree.parent.tolist(), is_leaf[1:].tolist(), tree.centre.tolist(), tree.weight.tolist(), strict=True
     ):
         lines.append(f"{parent} {leaf} {' '.join(map(str, centre))} {weight:.9g}")
-    Path(path).write_text("\n".join(lines), encoding="ascii")
+    files.write_text(path, "\n".join(lines))
 
 
 def _header(line: bytes, path: Path) -> tuple[int, int]:

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from slamcli import files
 from slamcli.errors import SlamError
 from slamcli.geometry import se3
 from slamcli.geometry.g2o_convention import from_g2o_information, to_g2o_information
@@ -21,13 +22,11 @@ def write_g2o(
     pose, measurement = _pose_rows(T_wk), _pose_rows(edge_T_ij)
     i, j = np.triu_indices(6)
     upper = to_g2o_information(np.asarray(edge_T_ij), np.asarray(information))[:, i, j]
-    with Path(path).open("w", encoding="ascii", newline="\n") as file:
-        for k, row in enumerate(pose):
-            file.write(f"VERTEX_SE3:QUAT {k} {_numbers(row)}\n")
-        for fixed in np.flatnonzero(is_fixed).tolist():
-            file.write(f"FIX {fixed}\n")
-        for (kf_i, kf_j), row, omega in zip(np.asarray(edge_kf).tolist(), measurement, upper, strict=True):
-            file.write(f"EDGE_SE3:QUAT {kf_i} {kf_j} {_numbers(row)} {_numbers(omega)}\n")
+    lines = [f"VERTEX_SE3:QUAT {k} {_numbers(row)}" for k, row in enumerate(pose)]
+    lines += [f"FIX {k}" for k in np.flatnonzero(is_fixed).tolist()]
+    for (kf_i, kf_j), row, omega in zip(np.asarray(edge_kf).tolist(), measurement, upper, strict=True):
+        lines.append(f"EDGE_SE3:QUAT {kf_i} {kf_j} {_numbers(row)} {_numbers(omega)}")
+    files.write_text(path, "".join(f"{line}\n" for line in lines))
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from slamcli import files
 from slamcli.errors import SlamError
 from slamcli.schema import Grid
 
@@ -60,11 +61,9 @@ def write(path: Path, grid: GridMap, *, start: tuple[float, float, float] | None
         f"{told}image: {_quoted(path.name)}\nmode: trinary\nresolution: {grid.resolution!r}\norigin: [{x!r}, {y!r}, 0.0]\n"
         f"negate: 0\noccupied_thresh: {OCCUPIED_THRESH}\nfree_thresh: {FREE_THRESH}\n"
     )
-    try:
-        path.write_bytes(b"P5\n%d %d\n255\n" % (columns, rows) + picture[::-1].tobytes())
-        page.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise SlamError(f"{error.filename or path}: cannot be written ({error.strerror}); choose another place") from error
+    with files.whole(path) as file, files.whole(page) as page_file:  # both are complete before either gets its name
+        page_file.write(text.encode())
+        file.write(b"P5\n%d %d\n255\n" % (columns, rows) + picture[::-1].tobytes())
     return path, page
 
 

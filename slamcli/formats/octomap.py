@@ -9,6 +9,7 @@ from typing import BinaryIO
 
 import numpy as np
 
+from slamcli import files
 from slamcli.errors import SlamError
 from slamcli.geometry import voxel
 from slamcli.geometry.octree import DEPTH, Level, Octree, levels, preorder, prune
@@ -93,7 +94,7 @@ def _write(path: Path, suffix: str, resolution: float, size: int, data: np.ndarr
         f"{MAGIC[suffix].decode()}\n# (feel free to add / change comments, but leave the first line as it is!)\n#\n"
         f"id {kind}\nsize {size}\nres {resolution:g}\ndata\n"
     )
-    with open(path, "wb") as file:
+    with files.whole(path) as file:
         file.write(header.encode())
         file.write(data.tobytes())
 

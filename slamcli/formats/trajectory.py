@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from slamcli import files
 from slamcli.errors import SlamError
 from slamcli.geometry import se3
 from slamcli.schema import Trajectory
@@ -35,13 +36,13 @@ def write_tum(path: str | Path, trajectory: Trajectory) -> None:
     quaternion = se3.quaternion_xyzw(trajectory.T_wc).reshape(-1, 4)
     rows = np.column_stack([trajectory.stamp, trajectory.T_wc[:, :3, 3], quaternion])
     lines = [f"{row[0]:.6f} " + " ".join(f"{value:.9f}" for value in row[1:]) + "\n" for row in rows]
-    _write(Path(path), "# timestamp tx ty tz qx qy qz qw\n" + "".join(lines))
+    files.write_text(path, "# timestamp tx ty tz qx qy qz qw\n" + "".join(lines))
 
 
 def write_kitti(path: str | Path, trajectory: Trajectory) -> None:
     """Write a KITTI trajectory, one line a pose in the order of the stamps."""
     rows = trajectory.T_wc[:, :3, :].reshape(-1, 12)
-    _write(Path(path), "".join(" ".join(f"{value:.9e}" for value in row) + "\n" for row in rows))
+    files.write_text(path, "".join(" ".join(f"{value:.9e}" for value in row) + "\n" for row in rows))
 
 
 def _data_lines(path: Path) -> list[tuple[int, str]]:
@@ -69,10 +70,3 @@ def _parse(path: Path, number: int, line: str) -> list[float]:
     if sum(q * q for q in row[4:]) < 1e-12:
         raise SlamError(f"{path}:{number}: the quaternion has length 0")
     return row
-
-
-def _write(path: Path, text: str) -> None:
-    try:
-        path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise SlamError(f"{path}: cannot be written ({error.strerror})") from error

@@ -272,6 +272,14 @@ def default_path(dataset: str) -> Path:
     return RUNS / dataset
 
 
+def refuse_inside(path: Path, *, own: str = "") -> None:
+    """Raise SlamError where a file to be written lies in a run directory, except by the name `own` in its top folder."""
+    real = Path(os.path.realpath(path))
+    for folder in real.parents:
+        if (folder / "run.json").is_file() and (folder / "config.toml").is_file() and (real.name != own or folder != real.parent):
+            raise SlamError(f"{path}: lies in the run directory {folder}, whose files are the run's own; choose a place outside")
+
+
 def outputs(folder: Path) -> dict[str, dict[str, Any]]:
     """List a stage's files with size and digest, by name."""
     paths = sorted(path for path in folder.rglob("*") if path.is_file() and path.name != "stage.json")

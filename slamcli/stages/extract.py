@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from slamcli import artifacts
+from slamcli import artifacts, files
 from slamcli.config.options import Config, ExtractConfig
 from slamcli.datasets import Dataset
 from slamcli.depth import at_key_points, icp
@@ -148,4 +148,4 @@ def _write_association(path: Path, dataset: Dataset, depth_stamp: np.ndarray) ->
     lines = ["# colour stamp [s], colour image, depth stamp [s], depth image; commented out: no usable depth image"]
     for stamp, colour, with_depth, depth in zip(dataset.stamp, dataset.colour_name, depth_stamp, dataset.depth_name, strict=True):
         lines.append(f"{stamp:.6f} {colour} {with_depth:.6f} {depth}" if np.isfinite(with_depth) else f"# {stamp:.6f} {colour}")
-    path.write_text("\n".join(lines) + "\n")
+    files.write_text(path, "\n".join(lines) + "\n")

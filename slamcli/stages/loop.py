@@ -1,12 +1,13 @@
 """loop: places seen again are joined, the whole map is adjusted, and all frames meet it once more."""
 
 import csv
+import io
 import itertools
 from pathlib import Path
 
 import numpy as np
 
-from slamcli import artifacts
+from slamcli import artifacts, files
 from slamcli.calibration import self_calibration
 from slamcli.calibration.self_calibration import Sensing
 from slamcli.config.options import Config
@@ -157,11 +158,12 @@ def closures_of(accepted: list[Candidate]) -> Closures:
 
 def write_candidates(path: Path, candidates: list[Candidate]) -> None:
     """Write the table of accepted and rejected candidates with the reason."""
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(["kf_i", "kf_j", "score", "matches", "inliers", "accepted", "reason"])
-        for c in candidates:
-            writer.writerow([c.kf_i, c.kf_j, f"{c.score:.4f}", c.n_matches, c.n_inliers, int(c.is_accepted), c.reason])
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["kf_i", "kf_j", "score", "matches", "inliers", "accepted", "reason"])
+    for c in candidates:
+        writer.writerow([c.kf_i, c.kf_j, f"{c.score:.4f}", c.n_matches, c.n_inliers, int(c.is_accepted), c.reason])
+    files.write_text(path, text.getvalue())
 
 
 def write_pose_graph(path: Path, T_wk: np.ndarray, graph: loop_closing.PoseGraph) -> None:

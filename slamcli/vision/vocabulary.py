@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 from numba import f4, f8, i4, i8, u8
 
+from slamcli import files
 from slamcli.errors import SlamError
 from slamcli.geometry.bits import hamming
 from slamcli.jit.kernel import kernel
@@ -111,7 +112,7 @@ def check(vocabulary: Vocabulary, *, source: str) -> Vocabulary:
 def save(path: str | Path, vocabulary: Vocabulary) -> None:
     """Write a vocabulary file (.npz)."""
     origin = np.frombuffer(vocabulary.origin.encode(), dtype=np.uint8)
-    with Path(path).open("wb") as file:  # an open file, as savez would add a suffix to a name
+    with files.whole(path) as file:
         np.savez(
             file, format=np.int32(FORMAT), centre=vocabulary.centre, first_child=vocabulary.first_child, idf=vocabulary.idf, origin=origin
         )

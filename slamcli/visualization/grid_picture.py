@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from slamcli import files
 from slamcli.errors import SlamError
 from slamcli.schema import Grid
 
@@ -34,10 +35,8 @@ def save_picture(path: Path, grid: Grid, *, trajectory: np.ndarray | None = None
     figure = Figure(figsize=tuple(inches))
     FigureCanvasAgg(figure)
     draw(figure.add_subplot(), grid, trajectory=trajectory, route=route, radius=radius, title=title)
-    try:
-        figure.savefig(path, dpi=130, bbox_inches="tight")
-    except OSError as error:
-        raise SlamError(f"{path}: cannot be written ({error.strerror or error}); choose another place") from None
+    with files.whole(path) as file:
+        figure.savefig(file, format=path.suffix[1:].lower(), dpi=130, bbox_inches="tight")
 
 
 def draw(axis: Any, grid: Grid, *, trajectory: np.ndarray | None = None, route: np.ndarray | None = None, radius: float = 0.0,

@@ -10,6 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from slamcli import files
 from slamcli.datasets import Dataset
 from slamcli.errors import BadFrame, SlamError
 from slamcli.evaluation.run_content import Content, collect
@@ -36,10 +37,17 @@ def view(run: RunDir, *, save: Path | None, images: int, progress: Progress) -> 
     rr = load_rerun()
     content = collect(run)
     recording = rr.RecordingStream("slamcli", recording_id=f"slamcli {run.path.resolve()}")
-    if save is not None:
-        recording.save(str(save), default_blueprint=_blueprint(bool(content.ape)))
-    else:
+    if save is None:
         _spawn(recording, _blueprint(bool(content.ape)))
+        _log(rr, recording, run, content, images, progress)
+        return
+    with files.whole(save) as file:
+        recording.save(file.name, default_blueprint=_blueprint(bool(content.ape)))
+        _log(rr, recording, run, content, images, progress)
+        recording.disconnect()  # writes the end of the file
+
+
+def _log(rr: Any, recording: Any, run: RunDir, content: Content, images: int, progress: Progress) -> None:
     recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     _log_paths(rr, recording, content)
     _log_maps(rr, recording, run)

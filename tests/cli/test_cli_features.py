@@ -92,7 +92,8 @@ def test_inspect_features_draws_both_and_tells_how_even_they_are(slamcli, tmp_pa
 
 
 @pytest.mark.parametrize(
-    "frame, out, fault", [(99, "out.png", "has no frame 99"), (0, "out.xyz", "not a kind of picture"), (0, "no/out.png", "folder")]
+    "frame, out, fault",
+    [(99, "out.png", "has no frame 99"), (0, "out.xyz", "not a kind of picture"), (0, "no/out.png", "its folder is not there")],
 )
 def test_inspect_features_refuses_in_one_line(slamcli, tmp_path: Path, room: Path, frame: int, out: str, fault: str) -> None:
     done = slamcli("inspect-features", room, frame, tmp_path / out)

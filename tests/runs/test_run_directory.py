@@ -247,7 +247,7 @@ def test_small_files_are_replaced_whole(tmp_path: Path, monkeypatch: pytest.Monk
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(os, "replace", fail)
-    with pytest.raises(OSError, match="No space"):
+    with pytest.raises(SlamError, match="config.toml: cannot be written .No space left on device; free some space"):
         files.write_text(path, "new")
     assert path.read_text() == "old"
     assert os.listdir(tmp_path) == ["config.toml"]
