@@ -66,12 +66,14 @@ def run(
     return Run(opened)
 
 
-def open_run(path: str | os.PathLike[str] | None = None) -> "Run":
+def open_run(path: str | os.PathLike[str] | None = None, *, restore: bool = False) -> "Run":
     """Open the run directory `path`; None: the one that $SLAMCLI_RUN names, else the last one made here.
 
-    Raises SlamError where there is none.
+    restore : where ``run.json`` or ``config.toml`` is damaged, write it anew from what the stages recorded
+
+    Raises SlamError where there is none, or a damaged one.
     """
-    return Run(RunDir.find(None if path is None else str(path)))
+    return Run(RunDir.find(None if path is None else str(path), restore=restore))
 
 
 class Run:
@@ -115,6 +117,7 @@ class Run:
         tell: Tell = log.info,
     ) -> "Run":
         """Change settings, if any are given, and run exactly the stages that need it; the arguments are those of `slamcli.run`."""
+        self.directory.restore()
         resolved = toml.resolve(self.config(), config, settings)
         _bring_up_to_date(self.directory, resolved, None, start=start, until=until, force=force, progress=progress, tell=tell)
         return self
@@ -226,9 +229,12 @@ def _create(
         return open_dataset(target, data=data, camera=dict(resolved.camera) or None, progress=progress)
 
     settings = settings if isinstance(settings, Mapping) else tuple(settings)
+    if path is not None:
+        RunDir(Path(path)).restore()
     first = toml.resolve(RunDir(Path(path)).config() if path is not None else None, config, settings)
     dataset = opened(first)
     place = Path(path) if path is not None else default_path(dataset.name)
+    RunDir(place).restore()
     resolved = toml.resolve(RunDir(place).config(), config, settings)
     if resolved.camera != first.camera:  # only now is it known that an earlier command gave this run another camera
         dataset = opened(resolved)

@@ -48,6 +48,11 @@ def save(value: Any, folder: Path) -> None:
             file.write(column.reshape(-1).view(np.uint8).data)  # numpy's own way hides why a write fails
 
 
+def file_names(cls: type) -> list[str]:
+    """List the files that `save` writes for a type."""
+    return [f"{spec.name}.npy" for spec in fields(cls)]
+
+
 def load(cls: type[Record], folder: Path) -> Record:
     """Read a record that `save` wrote; SlamError when a file is absent, torn, or not what `cls` declares.
 

@@ -62,6 +62,14 @@ def whole(path: str | Path) -> Iterator[BinaryIO]:
             raise
 
 
+def clear_leftover(path: str | Path) -> None:
+    """Remove what a killed process left of this file, unless one that lives is writing it."""
+    part = Path(path).with_name(f".{Path(path).name}.part")
+    if part.exists() and (file := _take(part)):
+        part.unlink(missing_ok=True)
+        file.close()
+
+
 def write_text(path: str | Path, text: str) -> None:
     """Replace a text file at once: a reader, or a power cut, meets the old text or the new."""
     write_bytes(path, text.encode())
@@ -79,7 +87,8 @@ def written(path: str | Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        if error.filename is None or error.filename == str(path) or str(error.filename).endswith(".part"):
+        ours = (str(path), str(Path(path).parent))
+        if error.filename is None or str(error.filename) in ours or str(error.filename).endswith(".part"):
             said = "its folder is not there; make it first" if error.errno == errno.ENOENT else told(error)
             raise SlamError(f"{path}: cannot be written ({said})") from error
         raise
@@ -162,7 +171,7 @@ def read_bytes(path: str | Path, *, limit: int) -> bytes:
     with open_regular(path) as file:
         data = file.read(limit + 1)
     if len(data) > limit:
-        raise SlamError(f"{path}: larger than {limit} bytes, which no such file is")
+        raise SlamError(f"{path}: too large; such a file has at most {limit} bytes")
     return data
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-FORMAT = 5  # of everything a run directory holds; raised whenever an array changes its meaning
+FORMAT = 6  # of everything a run directory holds; raised whenever an array changes its meaning
 
 
 def array(dtype: str, shape: str, meaning: str, *, may_lack: bool = False) -> Any:

@@ -18,7 +18,8 @@ MODULES = sorted(PACKAGE.rglob("*.py"))
 FLOORS = (
     ("errors", "data"),
     ("__init__", "user_cache"),
-    ("schema", "artifacts", "files", "parallel", "console", "open3d_loader"),
+    ("files",),
+    ("schema", "artifacts", "parallel", "console", "open3d_loader"),
     ("jit",),
     ("geometry",),
     ("vision", "formats", "config"),

@@ -215,9 +215,10 @@ def _record(folder: RunDir, file: str, figures: dict) -> None:
 
     target = folder.path / "eval" / file
     try:
-        target.parent.mkdir(exist_ok=True)
-        files.write_text(target, _json([figures]) + "\n")
-    except (OSError, SlamError) as error:
+        with files.written(target):
+            target.parent.mkdir(exist_ok=True)
+            files.write_text(target, _json([figures]) + "\n")
+    except SlamError as error:
         click.echo(f"Warning: {error}", err=True)
 
 

@@ -54,7 +54,7 @@ def run_command(
     named = run or os.environ.get("SLAMCLI_RUN")
     options: dict[str, Any] = {"settings": assignments, "config": config_name, "start": start, "until": until, "force": force}
     options |= {"progress": console.progress, "tell": console.say}
-    done = api.open_run(named).update(**options) if target is None else api.run(target, path=named, data=data, **options)
+    done = api.open_run(named, restore=True).update(**options) if target is None else api.run(target, path=named, data=data, **options)
     if as_json:
         click.echo(json.dumps(_made_object(done.directory), indent=1))
         return

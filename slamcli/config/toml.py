@@ -8,6 +8,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, get_args, get_origin, get_type_hints
 
+from slamcli import files
 from slamcli.config.options import Config
 from slamcli.errors import SlamError
 
@@ -47,19 +48,20 @@ def find(name_or_file: str) -> Path:
 
 def read(path: Path, base: Config | None = None) -> Config:
     """Merge a TOML file over `base` (the defaults); SlamError names the file and the key at fault."""
-    path = Path(path)
     try:
-        with open(path, "rb") as file:
-            text = file.read(LARGEST_FILE + 1)
+        text = files.read_bytes(path, limit=LARGEST_FILE)
     except OSError as error:
         raise SlamError(f"{path}: cannot be read ({error.strerror})") from error
-    if len(text) > LARGEST_FILE:
-        raise SlamError(f"{path}: too large for a configuration")
+    return parse(text, base, source=str(path))
+
+
+def parse(text: bytes, base: Config | None = None, *, source: str) -> Config:
+    """Merge TOML over `base` (the defaults); SlamError names `source` and the key at fault."""
     try:
         values = tomllib.loads(text.decode("utf-8"))
     except (UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError) as error:
-        raise SlamError(f"{path}: not valid TOML: {error}") from error
-    return merge(base or Config(), values, source=str(path))
+        raise SlamError(f"{source}: not valid TOML: {error}") from error
+    return merge(base or Config(), values, source=source)
 
 
 def merge(base: Config, values: Mapping[str, Any], *, source: str) -> Config:

@@ -71,15 +71,16 @@ class Inputs:
         """Read a record of arrays that `stage` wrote."""
         from slamcli import artifacts
 
-        return artifacts.load(cls, self._run.path / self._declared(stage))
+        names = artifacts.file_names(cls)
+        return artifacts.load(cls, self._run.intact(self._declared(stage), *names))
 
     def camera(self, stage: str = "extract") -> "Camera":
         """Give the intrinsics that extract used, or those known after optimize or loop."""
         return self._run.camera(self._declared(stage))
 
     def path(self, stage: str, *names: str) -> Path:
-        """Name a file that `stage` wrote."""
-        return self._run.path.joinpath(self._declared(stage), *names)
+        """Name a file that `stage` wrote, unchanged since; SlamError otherwise."""
+        return self._run.intact(self._declared(stage), *(["/".join(names)] if names else [])).joinpath(*names)
 
 
 class Tools:
@@ -170,7 +171,7 @@ class Pipeline:
             raise SlamError(f"--from {start} --until {until}: {until} comes before {start}")
         self._tell(f"{self.run.info()['dataset']} -> {self.run.path}")
         for index, stage in enumerate(STAGES[: last + 1]):
-            state = self.states()[stage.name]
+            state = self.states(verify=True)[stage.name]
             if state.is_fresh and index < first_forced:
                 self._tell(f"{stage.name:<9}  {state.state}")
                 continue
@@ -252,7 +253,8 @@ class Pipeline:
             "inputs": dict(inputs),
             "code": dict(code),
             "outputs": outputs,
-            "digest": staleness.digest({name: entry["sha256"] for name, entry in outputs.items()}),
+            "digest": files.digest({name: entry["sha256"] for name, entry in outputs.items()}),
+            "recording": {name: self.run.info()[name] for name in ("dataset", "root")},
             "environment": environment(),
             "seconds": round(meter.seconds, 3),
             "cpu_seconds": round(meter.cpu_seconds, 3),

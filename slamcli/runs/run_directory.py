@@ -4,8 +4,8 @@ A stage writes to ``.<stage>.<pid>/``; its record comes last, then one rename pu
 or absent, whatever kills the program.
 """
 
+import contextlib
 import fcntl
-import json
 import logging
 import os
 import shlex
@@ -16,11 +16,10 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from slamcli.config import toml
+from slamcli import files
 from slamcli.config.options import Config
 from slamcli.errors import SlamError
-from slamcli.files import read_json, sha256, write_text
-from slamcli.runs import source_code, staleness
+from slamcli.runs import damage, source_code, staleness
 from slamcli.runs.staleness import State
 from slamcli.schema import FORMAT
 from slamcli.stages import NAMES, STAGES
@@ -34,15 +33,6 @@ log = logging.getLogger(__name__)
 
 RUNS = Path("runs")
 LATEST = RUNS / "latest"
-RECORD_KEYS: dict[str, Any] = {
-    "stage": str,
-    "config": dict,
-    "inputs": dict,
-    "outputs": dict,
-    "digest": str,
-    "environment": dict,
-    "seconds": (int, float),
-}
 
 
 class RunDir:
@@ -55,14 +45,20 @@ class RunDir:
     # which run
 
     @classmethod
-    def find(cls, run: str | None) -> "RunDir":
-        """Open the run a command means: `run` (of -r), a folder or a name under runs/, else $SLAMCLI_RUN, else the one last touched."""
+    def find(cls, run: str | None, *, restore: bool = False) -> "RunDir":
+        """Open the run a command means: `run` (of -r), a folder or a name under runs/, else $SLAMCLI_RUN, else the one last touched.
+
+        restore : where the run's own files are damaged, restore them first
+        """
         named = run or os.environ.get("SLAMCLI_RUN")
         path = Path(named) if named else LATEST
-        if named and not (path / "run.json").is_file() and (RUNS / named / "run.json").is_file():
+        if named and not _is_run(path) and _is_run(RUNS / named):
             path = RUNS / named
-        if (path / "run.json").is_file():
-            return cls(path if named else Path(os.path.relpath(path.resolve())))._checked()
+        if _is_run(path):
+            found = cls(path if named else Path(os.path.relpath(path.resolve())))
+            if restore:
+                found.restore()
+            return found._checked()
         if named:
             raise SlamError(f"{path}: not a run directory (it has no run.json); make one with: slamcli run TARGET -r {path}")
         raise SlamError("no run here yet (runs/latest leads nowhere); make one with: slamcli run demo, or name one with -r")
@@ -71,33 +67,34 @@ class RunDir:
     def create(cls, path: Path, *, dataset: str, root: str, digest: str) -> "RunDir":
         """Make a run of the recording `dataset` at `root`, or open the run that is already there for the same recording."""
         run = cls(path)
-        if not (run.path / "run.json").exists():
+        if not _is_run(run.path):
             if run.path.is_dir() and any(not entry.name.startswith(".") for entry in run.path.iterdir()):
                 raise SlamError(f"{path}: the folder is not empty and not a run directory; name another with -r")
             run.path.mkdir(parents=True, exist_ok=True)
-            now = datetime.now(UTC).isoformat(timespec="seconds")
-            run._write_info({"format": FORMAT, "dataset": dataset, "root": root, "digest": digest, "created": now})
+            run._write_info({"dataset": dataset, "root": root, "digest": digest})
             return run
+        if not run._is_sealed("run.json"):  # nothing is left that would say of which recording the run is: its stages will tell
+            run._write_info({"dataset": dataset, "root": root, "digest": digest})
         info = run._checked().info()
         if info["root"] != root and info["digest"] != digest:
             raise SlamError(f"{path}: holds a run of another recording ({info['root']}); name another folder with -r")
         if info["root"] != root or info["digest"] != digest:
-            run._write_info({**info, "dataset": dataset, "root": root, "digest": digest})
+            run._write_info({"dataset": dataset, "root": root, "digest": digest, "created": info["created"]})
         return run
 
     def _checked(self) -> "RunDir":
         info = self.info()
         if info.get("format") != FORMAT:
             raise SlamError(f"{self.path}: a run of format {info.get('format')}, this slamcli reads {FORMAT}; start another with -r")
-        if not all(isinstance(info.get(name), str) for name in ("dataset", "root", "digest")):
-            raise SlamError(f"{self.path / 'run.json'}: dataset, root or digest is missing; start another run with -r")
+        if not all(isinstance(info.get(name), str) for name in ("dataset", "root", "digest", "created")):
+            raise SlamError(f"{self.path / 'run.json'}: dataset, root, digest or created is missing; start another run with -r")
         return self
 
     def mark_latest(self) -> None:
         """Point ``runs/latest`` here. A current folder that cannot be written to only means that there is no such link."""
         try:
             RUNS.mkdir(exist_ok=True)
-            link = RUNS / f".latest.{os.getpid()}"
+            link = RUNS / ".latest.part"
             link.unlink(missing_ok=True)
             link.symlink_to(os.path.relpath(self.path.resolve(), RUNS.resolve()))
             os.replace(link, LATEST)
@@ -113,19 +110,61 @@ class RunDir:
 
     def info(self) -> dict[str, Any]:
         """Read ``run.json``."""
-        return read_json(self.path / "run.json")
+        path = self.path / "run.json"
+        try:
+            return files.read_sealed(path)
+        except SlamError as error:
+            with contextlib.suppress(SlamError):
+                info = files.read_json(path)
+                if files.SEAL not in info and info.get("format") not in (None, FORMAT):  # older, not damaged
+                    return info
+            raise SlamError(f"{error}; restore it with: slamcli run {self.flag}, or: slamcli run TARGET {self.flag}") from error
 
     def _write_info(self, info: Mapping[str, Any]) -> None:
-        write_text(self.path / "run.json", json.dumps(info, indent=1) + "\n")
+        now = datetime.now(UTC).isoformat(timespec="seconds")
+        files.write_sealed(self.path / "run.json", {"format": FORMAT, "created": now, **info})
 
     def config(self) -> Config:
         """Read the run's configuration; the defaults before there is any."""
         path = self.path / "config.toml"
-        return toml.read(path) if path.exists() else Config()
+        return damage.read_config(path) if path.exists() else Config()
 
     def write_config(self, config: Config) -> None:
         """Make `config` the run's configuration."""
-        write_text(self.path / "config.toml", toml.dump(config))
+        damage.write_config(self.path / "config.toml", config)
+
+    def restore(self) -> None:
+        """Write ``run.json`` and ``config.toml`` anew where they are damaged, from what the finished stages recorded."""
+        is_run = _has_stage(self.path) or ((self.path / ".lock").is_file() and (self.path / "run.json").exists())
+        lacking = [name for name in ("run.json", "config.toml") if is_run and not self._is_sealed(name)]
+        if not lacking:
+            return
+        with self.lock():
+            records = self._records()
+            if "run.json" in lacking and (info := damage.restored_info(records)):
+                self._write_info(info)
+                log.warning("%s was damaged; restored from what the stages recorded", self.path / "run.json")
+            if "config.toml" in lacking:
+                self.write_config(damage.restored_config(records))
+                source = "what the stages recorded" if records else "the defaults, as no stage recorded its own"
+                log.warning("%s was damaged; restored from %s", self.path / "config.toml", source)
+
+    def _is_sealed(self, name: str) -> bool:
+        try:
+            (self.info if name == "run.json" else lambda: damage.read_config(self.path / name))()
+        except (SlamError, FileNotFoundError):
+            return False
+        return True
+
+    def _records(self) -> dict[str, dict[str, Any]]:
+        """Give the records of the stages that have a sound one, in the order in which they were written."""
+        found = {}
+        for stage in NAMES:
+            with contextlib.suppress(SlamError):
+                record = self.record(stage)
+                if record is not None and record["format"] == FORMAT:
+                    found[stage] = record
+        return dict(sorted(found.items(), key=lambda item: (self.path / item[0] / "stage.json").stat().st_mtime_ns))
 
     def dataset(self, config: Config | None = None) -> "Dataset":
         """Open the recording again, with the camera of `config` (the run's own)."""
@@ -142,7 +181,7 @@ class RunDir:
         from slamcli.geometry.camera import Camera
 
         path = self.stage_path(stage, "camera.json")
-        return Camera.from_dict(read_json(path), source=str(path))
+        return Camera.from_dict(files.read_json(path), source=str(path))
 
     # what a stage left
 
@@ -150,7 +189,9 @@ class RunDir:
         """Read a record of arrays that `stage` wrote."""
         from slamcli import artifacts
 
-        return artifacts.load(cls, self.stage_path(stage))
+        folder = self.stage_path(stage)
+        self.intact(stage, *artifacts.file_names(cls))
+        return artifacts.load(cls, folder)
 
     def stage_path(self, stage: str, *names: str) -> Path:
         """Name the folder of a finished stage, or a file in it; SlamError says how to make it when it is not there."""
@@ -159,8 +200,20 @@ class RunDir:
             raise SlamError(f"{self.path}: {stage} has not been run; try: slamcli run --until {stage} {self.flag}")
         if not path.exists():
             raise SlamError(f"{path}: not there; make it with: slamcli {stage} {self.flag}")
+        if names:
+            self.intact(stage, "/".join(names))
         self._warn_unless_fresh(stage)
         return path
+
+    def intact(self, stage: str, *names: str) -> Path:
+        """Give the folder of a finished stage after comparing files of it with the digests recorded; SlamError where one differs."""
+        record = self.record(stage) or {"outputs": {}}
+        for name in names:
+            if name not in record["outputs"]:
+                raise SlamError(f"{self.path / stage / name}: not there; make it with: slamcli {stage} {self.flag}")
+        if found := damage.find(self.path / stage, record["outputs"], names, verify=True):
+            raise SlamError(f"{self.path}/{found}: it is damaged; repair it with: slamcli run {self.flag}")
+        return self.path / stage
 
     def _warn_unless_fresh(self, stage: str) -> None:
         """Say once that a result is not what the run's configuration would give now."""
@@ -181,9 +234,9 @@ class RunDir:
         config = config or self.config()
         states: dict[str, State] = {}
         for stage in STAGES:
-            damage = self.damage(stage.name, verify=verify)
-            record = None if damage else self.record(stage.name)
-            states[stage.name] = staleness.assess(stage, config, record, damage, states, input_digest, source_code.of_stage(stage.name))
+            found = self.damage(stage.name, verify=verify)
+            record = None if found else self.record(stage.name)
+            states[stage.name] = staleness.assess(stage, config, record, found, states, input_digest, source_code.of_stage(stage.name))
         return states
 
     def record(self, stage: str) -> dict[str, Any] | None:
@@ -191,9 +244,12 @@ class RunDir:
         path = self.path / stage / "stage.json"
         if not path.parent.is_dir():
             return None
-        record = read_json(path)
-        if "format" not in record or (record["format"] == FORMAT and not _is_record(record)):
-            raise SlamError(f"{path}: not a stage's record")
+        try:
+            record = files.read_sealed(path)
+        except SlamError as error:
+            raise SlamError(f"{error}; repair it with: slamcli run {self.flag}") from error
+        if "format" not in record or (record["format"] == FORMAT and not damage.is_record(record)):
+            raise SlamError(f"{path}: not a stage's record; repair it with: slamcli run {self.flag}")
         return record
 
     def damage(self, stage: str, *, verify: bool = False) -> str:
@@ -201,18 +257,10 @@ class RunDir:
         try:
             record = self.record(stage)
         except SlamError as error:
-            return str(error).removeprefix(f"{self.path}/")
+            return str(error).removeprefix(f"{self.path}/").partition("; repair")[0]
         if record is None or record["format"] != FORMAT:
             return ""
-        for name, entry in record["outputs"].items():
-            path = self.path / stage / name
-            if not path.is_file():
-                return f"{stage}/{name} is not there"
-            if path.stat().st_size != entry["bytes"]:
-                return f"{stage}/{name} has {path.stat().st_size} bytes, {entry['bytes']} recorded"
-            if verify and sha256(path) != entry["sha256"]:
-                return f"{stage}/{name} has other content than recorded"
-        return ""
+        return damage.find(self.path / stage, record["outputs"], record["outputs"], verify=verify)
 
     # writing
 
@@ -242,6 +290,8 @@ class RunDir:
                 old.rename(self.path / stage)
             for leftover in self.path.glob(f".{stage}.*"):
                 shutil.rmtree(leftover)
+        for name in ("run.json", "config.toml"):
+            files.clear_leftover(self.path / name)
 
     @contextmanager
     def writing(self, stage: str) -> Iterator[Path]:
@@ -256,7 +306,7 @@ class RunDir:
 
     def commit(self, stage: str, folder: Path, record: Mapping[str, Any]) -> None:
         """Put a stage's finished folder in place of the one before, with its record."""
-        write_text(folder / "stage.json", json.dumps(record, indent=1) + "\n")
+        files.write_sealed(folder / "stage.json", record)
         place, old = self.path / stage, self.path / f".{stage}.old"
         if place.exists():
             place.rename(old)
@@ -272,6 +322,15 @@ def default_path(dataset: str) -> Path:
     return RUNS / dataset
 
 
+def _is_run(path: Path) -> bool:
+    """Say whether a folder is a run, if need be one that lost its ``run.json``."""
+    return (path / "run.json").is_file() or _has_stage(path)
+
+
+def _has_stage(path: Path) -> bool:
+    return any((path / stage / "stage.json").is_file() for stage in NAMES)
+
+
 def refuse_inside(path: Path, *, own: str = "") -> None:
     """Raise SlamError where a file to be written lies in a run directory, except by the name `own` in its top folder."""
     real = Path(os.path.realpath(path))
@@ -283,13 +342,4 @@ def refuse_inside(path: Path, *, own: str = "") -> None:
 def outputs(folder: Path) -> dict[str, dict[str, Any]]:
     """List a stage's files with size and digest, by name."""
     paths = sorted(path for path in folder.rglob("*") if path.is_file() and path.name != "stage.json")
-    return {path.relative_to(folder).as_posix(): {"bytes": path.stat().st_size, "sha256": sha256(path)} for path in paths}
-
-
-def _is_record(record: Mapping[str, Any]) -> bool:
-    if not all(isinstance(record.get(name), kind) for name, kind in RECORD_KEYS.items()) or "slamcli" not in record["environment"]:
-        return False
-    entries = record["outputs"].values()
-    return isinstance(record.get("code", {}), dict) and all(
-        isinstance(e, dict) and isinstance(e.get("bytes"), int) and isinstance(e.get("sha256"), str) for e in entries
-    )
+    return {path.relative_to(folder).as_posix(): {"bytes": path.stat().st_size, "sha256": files.sha256(path)} for path in paths}

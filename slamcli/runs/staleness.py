@@ -1,12 +1,12 @@
 """Whether what each stage left behind still holds, and why not. Pure: records in, states and reasons out."""
 
-import hashlib
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, fields
 from typing import Any
 
 from slamcli.config.options import Config
+from slamcli.files import digest
 from slamcli.runs import source_code
 from slamcli.schema import FORMAT
 from slamcli.stages import Stage
@@ -52,11 +52,6 @@ def named_files(stage: Stage, config: Config) -> dict[str, str]:
 def key(values: Mapping[str, Any], inputs: Mapping[str, str], code: Mapping[str, str]) -> str:
     """Digest everything a stage's result depends on."""
     return digest({"format": FORMAT, "config": values, "inputs": inputs, "code": code})
-
-
-def digest(value: Any) -> str:
-    """Digest a JSON value, independent of the order of its keys."""
-    return "sha256:" + hashlib.sha256(json.dumps(value, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
 
 
 def assess(

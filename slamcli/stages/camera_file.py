@@ -8,4 +8,4 @@ from slamcli.geometry.camera import Camera
 
 def write_camera(out: Path, camera: Camera) -> None:
     """Write `camera.json`: the recording's calibration, and in later stages what is known of the camera by then."""
-    (out / "camera.json").write_text(json.dumps(camera.to_dict(), indent=2) + "\n")
+    files.write_text(out / "camera.json", json.dumps(camera.to_dict(), indent=2) + "\n")

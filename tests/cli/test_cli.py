@@ -15,7 +15,7 @@ import pytest
 from click.testing import Result
 
 import slamcli as package
-from slamcli import datasets
+from slamcli import datasets, files
 from slamcli.cli.main import cli
 from slamcli.config.options import Config
 from slamcli.errors import SlamError
@@ -310,8 +310,8 @@ def test_status_says_that_the_recording_is_gone(fake: Path, slamcli: Slamcli) ->
 def test_status_says_what_was_made_with_other_versions(fake: Path, slamcli: Slamcli) -> None:
     slamcli("run", "recordings/desk")
     path = fake / "runs/desk/match/stage.json"
-    record = json.loads(path.read_text())
-    path.write_text(json.dumps({**record, "environment": {**record["environment"], "numpy": "1.0"}}))
+    record = files.read_sealed(path)
+    files.write_sealed(path, {**record, "environment": {**record["environment"], "numpy": "1.0"}})
     result = slamcli("status")
     assert "note: match made with numpy 1.0, here is" in result.stdout
     assert set(states(slamcli).values()) == {"up to date"}

@@ -73,7 +73,7 @@ def test_render_draws_the_map(slamcli: Callable, known: RunDir, what: str, tmp_p
         (("export-octree", "map.bt", "--colour"), "no room for colours"),
         (("export-mesh", "mesh.obj"), "must end in .ply"),
         (("render", "picture.gif"), "must end in .png or .jpg"),
-        (("export-octree", "no/such/folder/map.bt"), "No such file"),
+        (("export-octree", "no/such/folder/map.bt"), "its folder is not there"),
     ],
 )
 def test_what_cannot_be_written_is_said_in_one_line(slamcli: Callable, known: RunDir, here: Path, command: tuple, message: str) -> None:

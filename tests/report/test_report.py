@@ -14,6 +14,8 @@ import numpy as np
 import pytest
 from click.testing import Result
 
+
+from slamcli import files
 from slamcli.evaluation import map_verdict
 from slamcli.evaluation.run_content import collect
 from slamcli.report import doubts, make, pictures
@@ -127,10 +129,11 @@ def test_without_ground_truth_and_without_the_recording(slamcli: Command, tmp_pa
 def test_text_from_outside_stays_text(slamcli: Command, tmp_path: Path) -> None:
     evil = "</script><script>document.title='hit'</script><img src=x onerror=alert(1)>"
     made = finished.make(tmp_path, frames=30, n_lost=0)
-    info = json.loads((made.run / "run.json").read_text())
-    (made.run / "run.json").write_text(json.dumps({**info, "dataset": evil}))
-    record = json.loads((made.run / "track" / "stage.json").read_text())
-    (made.run / "track" / "stage.json").write_text(json.dumps({**record, "warnings": [evil], "summary": {"frames": 30, evil: evil}}))
+    for name, change in (
+        ("run.json", {"dataset": evil}),
+        ("track/stage.json", {"warnings": [evil], "summary": {"frames": 30, evil: evil}}),
+    ):
+        files.write_sealed(made.run / name, {**files.read_sealed(made.run / name), **change})
     page = page_of(slamcli, made.run, tmp_path / "report.html")
     assert page.images == 2  # the cloud, and a frame with its features
     assert page.text.count("onerror=alert(1)") >= 3

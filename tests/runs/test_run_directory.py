@@ -1,5 +1,6 @@
 """The run directory: which one is meant, damage, locks, commits, and what it says when it is not what it should be."""
 
+import dataclasses
 import json
 import os
 import subprocess
@@ -100,7 +101,7 @@ def test_a_folder_of_something_else_is_never_taken_over(tmp_path: Path) -> None:
     ("text", "message"),
     [
         (f'{{"format": {FORMAT + 1}}}', f"a run of format {FORMAT + 1}, this slamcli reads {FORMAT}"),
-        (f'{{"format": {FORMAT}}}', "dataset, root or digest is missing"),
+        (f'{{"format": {FORMAT}}}', "not as slamcli wrote it; restore it with: slamcli run -r"),
         ("{", "not valid JSON"),
         ("", "not valid JSON"),
         ("[" * 100_000, "not valid JSON"),
@@ -141,8 +142,8 @@ def test_other_content_of_the_same_size_is_found_by_verify(run: RunDir) -> None:
     ("text", "reason"),
     [
         ("", "loop/stage.json: not valid JSON"),
-        ("{}", "loop/stage.json: not a stage's record"),
-        (json.dumps({"format": FORMAT, "outputs": {"a": 1}}), "loop/stage.json: not a stage's record"),
+        ("{}", "loop/stage.json: not as slamcli wrote it"),
+        (json.dumps({"format": FORMAT, "outputs": {"a": 1}}), "loop/stage.json: not as slamcli wrote it"),
         (None, "loop/stage.json: not there"),
     ],
 )
@@ -155,8 +156,15 @@ def test_a_broken_record_is_damage(run: RunDir, text: str | None, reason: str) -
 @pytest.mark.parametrize("entry", [{}, {"bytes": "64", "sha256": ""}, 3])
 def test_a_hostile_record_is_damage_and_no_traceback(run: RunDir, entry: object) -> None:
     record = run.record("loop")
-    (run.path / "loop" / "stage.json").write_text(json.dumps({**record, "outputs": {"../../../etc/passwd": entry}}))
-    assert state(run, "loop")[0] == "damaged"
+    files.write_sealed(run.path / "loop" / "stage.json", {**record, "outputs": {"../../../etc/passwd": entry}})
+    assert state(run, "loop") == ("damaged", "loop/stage.json: not a stage's record")
+
+
+def test_a_record_that_lacks_anything_is_damage(run: RunDir) -> None:
+    record = run.record("loop")
+    for name in record.keys() - {"format", "key", "recording"}:
+        files.write_sealed(run.path / "loop" / "stage.json", {key: value for key, value in record.items() if key != name})
+        assert state(run, "loop") == ("damaged", "loop/stage.json: not a stage's record")
 
 
 def test_damage_is_mended_by_running_again(run: RunDir) -> None:
@@ -175,7 +183,7 @@ def test_a_result_of_another_version_is_stale(run: RunDir) -> None:
         ({"code": {**record["code"], "slam/tracker.py": "0" * 12}}, "code: slam/tracker.py changed"),
         ({"format": FORMAT - 1}, f"code: format {FORMAT - 1} -> {FORMAT}"),
     ):
-        (run.path / "track" / "stage.json").write_text(json.dumps({**record, **change}))
+        files.write_sealed(run.path / "track" / "stage.json", {**record, **change})
         assert state(run, "track")[0] == "stale"
         assert state(run, "track")[1].startswith(reason)
 
@@ -192,8 +200,7 @@ def test_a_missing_stage_is_named_with_the_command_that_makes_it(run: RunDir, ca
 
 
 def test_reading_a_stale_result_warns_once(run: RunDir, caplog: pytest.LogCaptureFixture) -> None:
-    text = (run.path / "config.toml").read_text()
-    (run.path / "config.toml").write_text(text.replace("seed = 0", "seed = 1"))
+    run.write_config(dataclasses.replace(run.config(), seed=1))
     run.stage_path("loop")
     run.stage_path("loop")
     assert caplog.text.count("loop is stale (config: seed 0 -> 1); bring it up to date with: slamcli run") == 1

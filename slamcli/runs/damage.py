@@ -1,0 +1,97 @@
+"""What a run's files are checked against, and what those of them that no stage can make again are restored from."""
+
+import hashlib
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from slamcli.config import toml
+from slamcli.config.options import Config
+from slamcli.errors import SlamError
+from slamcli.files import read_bytes, sha256, write_bytes
+
+Records = Mapping[str, Mapping[str, Any]]  # stage.json by stage
+
+SEAL = "# sealed "  # begins the last line of config.toml; the digest of all above it follows
+RECORD_KEYS: dict[str, Any] = {
+    "stage": str,
+    "config": dict,
+    "inputs": dict,
+    "outputs": dict,
+    "digest": str,
+    "environment": dict,
+    "seconds": (int, float),
+    "cpu_seconds": (int, float),
+    "compile_seconds": (int, float),
+    "fps": (int, float, type(None)),
+    "peak_rss_mb": (int, float),
+    "summary": dict,
+    "warnings": list,
+    "n_warnings": int,
+    "code": dict,
+}
+
+
+def is_record(record: Mapping[str, Any]) -> bool:
+    """Say whether a ``stage.json`` has all that a stage's record has."""
+    if not all(name in record and isinstance(record[name], kind) for name, kind in RECORD_KEYS.items()):
+        return False
+    if "slamcli" not in record["environment"]:
+        return False
+    entries = record["outputs"].values()
+    return all(isinstance(e, dict) and isinstance(e.get("bytes"), int) and isinstance(e.get("sha256"), str) for e in entries)
+
+
+def find(folder: Path, outputs: Mapping[str, Any], names: Iterable[str], *, verify: bool) -> str:
+    """Say what is wrong with files of a stage's folder, or "": each has its recorded size and, with `verify`, its recorded digest."""
+    for name in names:
+        path, entry = folder / name, outputs[name]
+        if not path.is_file():
+            return f"{folder.name}/{name} is not there"
+        if path.stat().st_size != entry["bytes"]:
+            return f"{folder.name}/{name} has {path.stat().st_size} bytes, {entry['bytes']} recorded"
+        if verify and sha256(path) != entry["sha256"]:
+            return f"{folder.name}/{name} has other content than recorded"
+    return ""
+
+
+def write_config(path: Path, config: Config) -> None:
+    """Write a configuration that `read_config` finds unchanged."""
+    text = toml.dump(config).encode()
+    write_bytes(path, text + _seal(text))
+
+
+def read_config(path: Path) -> Config:
+    """Read a run's configuration; SlamError when a single bit of it is another than when it was written.
+
+    A file cut short may still be valid TOML, and would silently fall back to the defaults.
+    """
+    data = read_bytes(path, limit=toml.LARGEST_FILE)
+    text = data[: data.rfind(SEAL.encode())] if SEAL.encode() in data else b""
+    if text + _seal(text) != data:
+        raise SlamError(
+            f"{path}: not as slamcli wrote it; slamcli run restores it from what the stages recorded, "
+            "or takes your changes with -s section.key=value or --config FILE"
+        )
+    return toml.parse(text, source=str(path))
+
+
+def _seal(text: bytes) -> bytes:
+    return f"{SEAL}{hashlib.sha256(text).hexdigest()}\n".encode()
+
+
+def restored_config(records: Records) -> Config:
+    """Put the configuration together that the stages ran with, those that ran last having the last word; else the defaults."""
+    config = Config()
+    for stage, record in records.items():
+        config = toml.merge(config, record["config"], source=f"{stage}/stage.json")
+    return config
+
+
+def restored_info(records: Records) -> dict[str, str]:
+    """Give the name, the folder and the digest of the recording that the stages read; nothing where none recorded it."""
+    for record in reversed(records.values()):
+        recording = record.get("recording", {})
+        if "dataset" in record["inputs"] and {"dataset", "root"} <= recording.keys():
+            return {"dataset": recording["dataset"], "root": recording["root"], "digest": record["inputs"]["dataset"]}
+    return {}
