@@ -2,6 +2,7 @@
 
 from dataclasses import fields
 from pathlib import Path
+from tokenize import TokenError
 from typing import Any, TypeVar
 
 import numpy as np
@@ -73,5 +74,7 @@ def _read(path: Path) -> np.ndarray:
             return np.asarray(np.lib.format.open_memmap(path, mode="c"))
     except FileNotFoundError:
         raise ValueError(f"{path.name} is not there") from None
-    except (ValueError, EOFError, FloatingPointError) as error:  # a map larger than its file is refused before anything is read
+    except (ValueError, EOFError, FloatingPointError, SyntaxError, TokenError) as error:  # a map larger than its file is refused unread
         raise ValueError(f"{path.name}: {error}") from error
+    except OSError as error:
+        raise SlamError(f"{path}: cannot be read ({files.told(error)})") from error

@@ -3,6 +3,7 @@
 The library takes a `Progress` and a `Tell` from its caller: the command line gives `progress` and `say`, a notebook its own or none.
 """
 
+import contextlib
 import logging
 import os
 import sys
@@ -43,6 +44,13 @@ class _StderrHandler(logging.Handler):
         _write(f"{record.levelname.capitalize()}: {record.getMessage()}" if record.levelno >= logging.WARNING else record.getMessage())
 
 
+class _LogFile(logging.FileHandler):
+    """The run's log. A disk that is full stops the run where it writes results, and says so there."""
+
+    def handleError(self, record: logging.LogRecord) -> None:
+        """Go on without this line."""
+
+
 def say(line: str) -> None:
     """Write one line to stderr, above a progress bar if there is one; nothing under `--quiet`."""
     if not _Voice.is_quiet:
@@ -51,14 +59,15 @@ def say(line: str) -> None:
 
 def amber(text: str) -> str:
     """Colour what asks for attention, where stderr is a terminal that wants colours."""
-    return f"{AMBER}{text}{PLAIN}" if sys.stderr.isatty() and "NO_COLOR" not in os.environ else text
+    return f"{AMBER}{text}{PLAIN}" if sys.stderr and sys.stderr.isatty() and "NO_COLOR" not in os.environ else text
 
 
 def _write(line: str) -> None:
-    if "tqdm" in sys.modules:
-        sys.modules["tqdm"].tqdm.write(line, file=sys.stderr)
-    else:
-        sys.stderr.write(line + "\n")
+    with contextlib.suppress(OSError, ValueError, AttributeError):  # full or gone, closed, absent: no reason to stop
+        if "tqdm" in sys.modules:
+            sys.modules["tqdm"].tqdm.write(line, file=sys.stderr)
+        else:
+            sys.stderr.write(line + "\n")
 
 
 def set_up(verbosity: int, *, quiet: bool = False) -> None:
@@ -75,7 +84,7 @@ def set_up(verbosity: int, *, quiet: bool = False) -> None:
 @contextmanager
 def log_file(path: Path) -> Iterator[None]:
     """Append everything that is logged meanwhile to a file, and the traceback of what ends it early."""
-    handler = logging.FileHandler(path, encoding="utf-8")
+    handler = _LogFile(path, encoding="utf-8")
     handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
     ROOT.addHandler(handler)
     try:
@@ -85,7 +94,8 @@ def log_file(path: Path) -> Iterator[None]:
         raise
     finally:
         ROOT.removeHandler(handler)
-        handler.close()
+        with contextlib.suppress(OSError):
+            handler.close()
 
 
 def silent(iterable: Iterable[Item], label: str = "", total: int | None = None) -> Iterable[Item]:
@@ -98,7 +108,7 @@ def progress(iterable: Iterable[Item], label: str, total: int | None = None) -> 
 
     label : what is done; a last word in [brackets] says what is counted, else frames are
     """
-    if not sys.stderr.isatty() or _Voice.is_quiet:
+    if sys.stderr is None or not sys.stderr.isatty() or _Voice.is_quiet:
         yield from iterable
         return
     from tqdm import tqdm

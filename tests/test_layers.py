@@ -18,7 +18,7 @@ MODULES = sorted(PACKAGE.rglob("*.py"))
 FLOORS = (
     ("errors", "data"),
     ("__init__", "user_cache"),
-    ("files",),
+    ("files", "interruption"),
     ("schema", "artifacts", "parallel", "console", "open3d_loader"),
     ("jit",),
     ("geometry",),

@@ -6,10 +6,11 @@ from typing import Any
 
 import click
 
-from slamcli import __version__, files
+from slamcli import __version__, files, interruption
 from slamcli.cli.common import verbose_option
 from slamcli.errors import SlamError
 
+LACKING = ("Cannot allocate", "failed to map", "start new thread", "load shared object")  # in the errors of libraries short of memory
 TOPICS = ("run", "evaluate", "export", "maps", "grid", "visualize", "localize", "simulate", "features", "vocab")  # modules of this package
 
 
@@ -21,23 +22,35 @@ class Group(click.Group):
         return list(self.commands)
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Run the command. Status 1: the user can mend it; 130: interrupted. Anything else is a bug and keeps its traceback."""
+        """Run the command. Status 1: the user can mend it; 130: interrupted, 143: terminated. The rest is a bug and keeps its traceback."""
         try:
-            return super().invoke(ctx)
+            with interruption.raising():
+                return super().invoke(ctx)
         except SlamError as error:
             raise click.ClickException(str(error)) from error
         except OSError as error:
-            if error.errno is None or error.errno == errno.EPIPE:
+            if error.errno == errno.EPIPE or (error.errno is None and not _lacks_memory(error)):
                 raise
             raise click.ClickException(_told(error)) from error
-        except MemoryError as error:
+        except (MemoryError, ImportError, RuntimeError) as error:
+            if not _lacks_memory(error):
+                raise
             raise click.ClickException("out of memory; close other programs or use fewer features, a coarser voxel") from error
-        except KeyboardInterrupt as error:
-            click.echo(f"Error: {error if error.args else 'interrupted'}", err=True)
-            ctx.exit(130)
+        except (KeyboardInterrupt, SystemError) as error:
+            if (found := interruption.found_in(error)) is None:
+                raise
+            click.echo(f"Error: {found}", err=True)
+            ctx.exit(found.exit_status)
+
+
+def _lacks_memory(error: Exception) -> bool:
+    """Say whether memory, or the threads that need some, could not be had; a library may not even load then."""
+    return isinstance(error, MemoryError) or any(said in str(error) for said in LACKING)
 
 
 def _told(error: OSError) -> str:
+    if error.errno is None:
+        return f"too little memory to load a library, or it is damaged ({str(error).splitlines()[0]})"
     return f"{error.filename}: {files.told(error)}" if error.filename is not None else files.told(error)
 
 

@@ -10,7 +10,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from slamcli import __version__, files
+from slamcli import __version__, files, interruption
 from slamcli.config.options import Config
 from slamcli.console import Progress, Tell, silent, stage_line
 from slamcli.errors import SlamError
@@ -215,9 +215,9 @@ class Pipeline:
                     meter.watch_compiler(self._tell)
                     summary = module.run(Inputs(stage, self.run, self.dataset), out, Settings(stage, self.config), tools)
             except (KeyboardInterrupt, SystemError) as error:
-                if not _is_interrupt(error):
+                if (found := interruption.found_in(error)) is None:
                     raise
-                raise KeyboardInterrupt(f"interrupted in {stage.name}; earlier stages are kept") from None
+                raise interruption.Interrupted(found.number, f" in {stage.name}; earlier stages are kept") from None
             record = self._record(stage, inputs, run_directory.outputs(out), meter, tools, summary)
             self.run.commit(stage.name, out, record)
         log.debug("%s", record)
@@ -265,13 +265,6 @@ class Pipeline:
             "warnings": tools.warnings,
             "n_warnings": tools.n_warnings,
         }
-
-
-def _is_interrupt(error: BaseException | None) -> bool:
-    """Tell whether an error began as Ctrl-C: one that comes while a kernel is looked up reaches us as numba's SystemError."""
-    while error is not None and not isinstance(error, KeyboardInterrupt):
-        error = error.__cause__ or error.__context__
-    return error is not None
 
 
 def _plain(value: Any) -> Any:

@@ -273,9 +273,9 @@ class RunDir:
             except BlockingIOError:
                 file.seek(0)
                 raise SlamError(f"{self.path}: in use by another slamcli (process {file.read(20).strip() or '?'}); wait for it") from None
-            file.truncate(0)
-            file.write(f"{os.getpid()}\n")
-            file.flush()
+            with files.written(self.path / ".lock"):
+                file.truncate(0)
+                os.write(file.fileno(), f"{os.getpid()}\n".encode())
             self._recover()
             yield
 

@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 
+from slamcli import files
 from slamcli.geometry.camera import Camera
 
 
