@@ -9,13 +9,13 @@ import secrets
 import stat
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from io import BufferedReader
 from pathlib import Path
 from typing import Any, BinaryIO
 
 from slamcli.errors import SlamError
 
 LARGEST_JSON = 16 << 20  # bytes; a record is a few kB
-BLOCK = 1 << 20  # bytes digested at a time
 LONGEST_NAME = 200  # bytes of a file name; systems allow 255, and the temporary file's is longer
 MOST_LINKS = 40  # followed, as Linux does
 ADVICE = {
@@ -47,8 +47,8 @@ def whole(path: str | Path) -> Iterator[BinaryIO]:
     with written(path):
         place = _end_of_links(path)
         if place is None:
-            with open(path, "wb") as file:
-                yield file
+            with open(path, "wb") as target:
+                yield target
             return
         part, file = _open_part(place)
         try:
@@ -175,7 +175,7 @@ def read_bytes(path: str | Path, *, limit: int) -> bytes:
     return data
 
 
-def open_regular(path: str | Path) -> BinaryIO:
+def open_regular(path: str | Path) -> BufferedReader:
     """Open a file for reading; SlamError where it is no regular one. A pipe without a writer is refused instead of waited for."""
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
@@ -221,10 +221,7 @@ def sha256(path: Path) -> str:
         found = os.fstat(file.fileno())
         key = (found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns, found.st_ctime_ns)
         if key not in _known:
-            content = hashlib.sha256()
-            while block := file.read(BLOCK):
-                content.update(block)
-            _known[key] = content.hexdigest()
+            _known[key] = hashlib.file_digest(file, "sha256").hexdigest()
     return _known[key]
 
 

@@ -1,6 +1,7 @@
 """Options that several commands share."""
 
 import math
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
@@ -54,7 +55,7 @@ class Target(click.Path):
         """Refuse a place in a run directory before any work is done."""
         from slamcli.runs.run_directory import refuse_inside
 
-        path = Path(super().convert(value, param, ctx))
+        path = Path(os.fsdecode(super().convert(value, param, ctx)))
         refuse_inside(path, own=self.own)
         return path
 

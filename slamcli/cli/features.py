@@ -41,10 +41,10 @@ def inspect_features(recording: str, frame: int, out: Path, data: str | None, fe
         even = comparison.evenness(points.xy, dataset.camera.width, dataset.camera.height)
         figures[name] = {"points": len(points), "cells_hit": round(even.share, 4), "variance_to_mean": round(even.ratio, 3)}
     try:
-        _, data = cv2.imencode(out.suffix, comparison.side_by_side(grey, *found.values()))
+        _, picture = cv2.imencode(out.suffix, comparison.side_by_side(grey, *found.values()))
     except cv2.error as error:
         raise SlamError(f"{out}: not a kind of picture that can be written; take .png or .jpg") from error
-    files.write_bytes(out, data.tobytes())
+    files.write_bytes(out, picture.tobytes())
     if as_json:
         click.echo(json.dumps(figures, indent=1))
         return

@@ -2,7 +2,6 @@
 
 import ast
 import dataclasses
-import json
 import shutil
 import subprocess
 import sys
@@ -11,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from slamcli import files
 from slamcli.config import options
 from slamcli.runs import source_code
 from slamcli.runs.run_directory import RunDir
@@ -134,8 +134,8 @@ def test_status_names_the_file_and_what_rests_on_the_stage(edit, room_run: Path,
 def test_a_record_without_sources_is_stale_and_a_hostile_one_is_damage(room_run: Path, tmp_path: Path) -> None:
     run = RunDir(shutil.copytree(room_run, tmp_path / "run"))
     path = run.path / "match" / "stage.json"
-    record = json.loads(path.read_text())
-    path.write_text(json.dumps({**record, "code": {}}))
+    record = files.read_sealed(path)
+    files.write_sealed(path, {**record, "code": {}})
     assert run.states()["match"].reason == "code: its sources were not recorded"
-    path.write_text(json.dumps({**record, "code": ["stages/match.py"]}))
+    files.write_sealed(path, {**record, "code": ["stages/match.py"]})
     assert run.states()["match"].state == "damaged"
