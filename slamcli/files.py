@@ -1,12 +1,15 @@
 """Files that appear whole or not at all, files read with suspicion, and digests."""
 
+import contextlib
 import errno
 import fcntl
 import hashlib
 import json
 import os
 import secrets
+import shutil
 import stat
+import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from io import BufferedReader
@@ -27,6 +30,7 @@ ADVICE = {
     errno.EACCES: "choose a place you may write to",
     errno.EROFS: "choose a place you may write to",
 }
+ALIVE = ".alive"  # in a folder of `scratch`, locked as long as its process lives
 SEAL = "sealed"  # key of a sealed JSON object that holds the digest of all others
 
 _known: dict[tuple[int, ...], str] = {}  # digests of files this process has read, by what changes when a file does
@@ -161,6 +165,19 @@ def _take(part: Path) -> BinaryIO | None:
 
 def _open_as_it_is(path: str, _: int) -> int:
     return os.open(path, os.O_WRONLY | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC, 0o666)
+
+
+@contextmanager
+def scratch(prefix: str) -> Iterator[Path]:
+    """Make a folder for this process alone, removed in the end; what killed processes left under this prefix is removed first."""
+    for left in Path(tempfile.gettempdir()).glob(f"{prefix}*"):
+        with contextlib.suppress(OSError), open(left / ALIVE, "rb") as file:  # another user's, or removed by another process just now
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if left.lstat().st_uid == os.geteuid():
+                shutil.rmtree(left)
+    with tempfile.TemporaryDirectory(prefix=prefix) as folder, open(Path(folder) / ALIVE, "xb") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield Path(folder)
 
 
 # read with suspicion

@@ -181,6 +181,17 @@ def test_any_name_that_a_file_may_have(tmp_path: Path, name: str) -> None:
     assert os.listdir(tmp_path) == [name]
 
 
+def test_scratch_folders_of_the_dead_go_and_those_of_the_living_stay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    code = "import os, sys; from slamcli import files\nwith files.scratch('try-') as f: (f / 'x').write_text('x'); os._exit(9)"
+    environment = {**os.environ, "TMPDIR": str(tmp_path), "PYTHONPATH": os.pathsep.join(sys.path)}
+    subprocess.run([sys.executable, "-c", code], env=environment, timeout=60)
+    assert len(os.listdir(tmp_path)) == 1
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    with files.scratch("try-") as first, files.scratch("try-") as second:
+        assert sorted(tmp_path.iterdir()) == sorted([first, second])
+    assert not os.listdir(tmp_path)
+
+
 # read with suspicion
 
 

@@ -4,7 +4,6 @@ numba's own setting, $NUMBA_CACHE_DIR, holds for every kernel of a process, thos
 """
 
 import atexit
-import contextlib
 import functools
 import hashlib
 import os
@@ -18,6 +17,7 @@ from numba.core.caching import CompileResultCacheImpl, FunctionCache, _CacheLoca
 from slamcli.user_cache import user_cache
 
 PACKAGE = Path(__file__).parents[1]
+UNSAVED: list[OSError] = []  # why kernels of this process could not be kept
 
 
 @functools.cache
@@ -91,5 +91,7 @@ class KernelCache(FunctionCache):
 
     def save_overload(self, sig: Any, data: Any) -> None:
         """Save machine code. A folder that is full or not to be written to costs time in the next process, and nothing now."""
-        with contextlib.suppress(OSError):
+        try:
             super().save_overload(sig, data)
+        except OSError as error:
+            UNSAVED.append(error)

@@ -36,6 +36,10 @@ COMPILING = "compiling kernels; this happens once"
 log = logging.getLogger(__name__)
 
 
+class IncompleteError(Exception):
+    """Some kernels were not compiled, or not kept."""
+
+
 def ensure(*, progress: Progress = silent, tell: Tell = log.info) -> None:
     """Compile what the run will call, if that was not done on this machine for these sources."""
     from slamcli.jit import cache
@@ -45,8 +49,12 @@ def ensure(*, progress: Progress = silent, tell: Tell = log.info) -> None:
         return
     start, n = time.perf_counter(), 0
     tell(COMPILING)
-    for _ in progress(compile_all(_cores()), "compiling [kernels]"):
-        n += 1
+    try:
+        for _ in progress(compile_all(_cores()), "compiling [kernels]"):
+            n += 1
+    except IncompleteError:  # not marked as done: the next run tries again
+        log.warning("%s: not every kernel could be kept there, so they are compiled anew each time; is the disk full?", done.parent)
+        return
     log.info("compiled %d kernels in %.1f s", n, time.perf_counter() - start)
     with contextlib.suppress(OSError):  # a full disk: the next run looks again, and finds what could be kept
         done.parent.mkdir(parents=True, exist_ok=True)
@@ -56,33 +64,40 @@ def ensure(*, progress: Progress = silent, tell: Tell = log.info) -> None:
 def compile_all(processes: int) -> Iterator[str]:
     """Compile all declared kernels in several processes; yield a name as each is done. What fails is left to numba at the first call.
 
+    Raises IncompleteError in the end where a process failed, or could not keep what it compiled.
     Nobody reads the errors that numba words, in colour, for every candidate type it tries in vain: without them it is a tenth faster.
     """
     from slamcli.jit import cache
 
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(cache.folder().parent), "NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING": "1"}
     home = Path(__file__).parents[2]  # there a child finds this very package first: another copy's kernels are cached apart
+    children: list[subprocess.Popen] = []
     with contextlib.ExitStack() as stack:
         read, write = os.pipe()
         names = stack.enter_context(os.fdopen(read))
         for share in range(processes):
             command = [sys.executable, "-c", CHILD, str(share), str(processes)]
             child = subprocess.Popen(command, cwd=home, env=environment, stdin=subprocess.DEVNULL, stdout=write, stderr=subprocess.DEVNULL)
+            children.append(child)
             stack.callback(child.wait)
             stack.callback(child.terminate)
         os.close(write)  # so that the pipe ends with the last child
         for name in names:
             yield name.strip()
+        if any(child.wait() for child in children):
+            raise IncompleteError
 
 
 def compile_share(share: int, shares: int) -> None:
     """Compile every `shares`-th kernel, from number `share` on; a line on standard output tells of each."""
+    from slamcli.jit.cache import UNSAVED
     from slamcli.jit.kernel import argument_types
 
     for compiled in declared()[share::shares]:
         compiled.compile(argument_types(compiled))
         sys.stdout.write(f"{compiled.py_func.__qualname__}\n")
         sys.stdout.flush()
+    sys.exit(1 if UNSAVED else 0)
 
 
 def declared() -> list[Any]:

@@ -1,9 +1,7 @@
 """Find the camera of a new recording in the map of an old run."""
 
-import tempfile
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,6 +11,7 @@ from slamcli.calibration.self_calibration import Sensing
 from slamcli.config.options import Config
 from slamcli.datasets import Dataset
 from slamcli.errors import SlamError
+from slamcli.files import scratch
 from slamcli.runs.pipeline import Pipeline
 from slamcli.runs.run_directory import RunDir
 from slamcli.schema import LOST, CoarseDepth, Features, Map, Matches, Timing, Tracks, Trajectory, Words, trajectory
@@ -52,8 +51,8 @@ def localise(run: RunDir, recording: Dataset, *, progress: Progress) -> Localise
     """
     config = run.config()
     run.stage_path("loop")
-    with tempfile.TemporaryDirectory(prefix="slamcli-localize-") as folder:
-        new = RunDir.create(Path(folder) / "run", dataset=recording.name, root=str(recording.root.resolve()), digest=recording.digest())
+    with scratch("slamcli-localize-") as folder:
+        new = RunDir.create(folder / "run", dataset=recording.name, root=str(recording.root.resolve()), digest=recording.digest())
         new.write_config(config)
         Pipeline(new, config, dataset=recording).bring_up_to_date(until="match")
         return _find(run, new, config, progress)

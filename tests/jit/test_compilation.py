@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from test_files import largest_file
 
 from slamcli.jit import cache, compilation
 from slamcli.jit.kernel import argument_types
@@ -96,9 +97,24 @@ def test_the_processes_really_compile_and_leave_their_kernels_in_the_folder(monk
     assert len(list(tmp_path.rglob("*.nbc"))) >= len(names)
 
 
+
 def test_a_process_compiles_its_share_and_names_it() -> None:
     home = Path(compilation.__file__).parents[2]
     command = [sys.executable, "-c", compilation.CHILD, "0", str(len(compilation.declared()))]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120, cwd=home)
     assert done.returncode == 0, done.stderr
     assert done.stdout.split() == [compilation.declared()[0].py_func.__qualname__]
+
+
+def test_a_full_folder_is_told_and_not_taken_for_a_finished_one(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(cache, "folder", lambda: tmp_path / "kernels")
+    few = "import sys; from slamcli.jit import compilation; compilation.PACKAGES = ('geometry',); compilation.compile_share(0, 1)"
+    monkeypatch.setattr(compilation, "CHILD", few)
+    with largest_file(500):
+        compilation.ensure()
+    assert "kernels: not every kernel could be kept there" in caplog.text
+    assert not list(tmp_path.rglob("compiled-*"))
+    compilation.ensure()
+    assert len(list(tmp_path.rglob("compiled-*"))) == 1

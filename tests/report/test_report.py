@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 from click.testing import Result
 
-
 from slamcli import files
 from slamcli.evaluation import map_verdict
 from slamcli.evaluation.run_content import collect
