@@ -97,7 +97,6 @@ def test_the_processes_really_compile_and_leave_their_kernels_in_the_folder(monk
     assert len(list(tmp_path.rglob("*.nbc"))) >= len(names)
 
 
-
 def test_a_process_compiles_its_share_and_names_it() -> None:
     home = Path(compilation.__file__).parents[2]
     command = [sys.executable, "-c", compilation.CHILD, "0", str(len(compilation.declared()))]
