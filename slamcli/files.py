@@ -6,10 +6,12 @@ import fcntl
 import hashlib
 import json
 import os
+import re
 import secrets
 import shutil
 import stat
 import tempfile
+import tomllib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from io import BufferedReader
@@ -31,6 +33,7 @@ ADVICE = {
     errno.EROFS: "choose a place you may write to",
 }
 ALIVE = ".alive"  # in a folder of `scratch`, locked as long as its process lives
+MOST_DOTS = 32  # in one word of a TOML file: a key of so many parts, or a file name
 SEAL = "sealed"  # key of a sealed JSON object that holds the digest of all others
 
 _known: dict[tuple[int, ...], str] = {}  # digests of files this process has read, by what changes when a file does
@@ -186,8 +189,9 @@ def scratch(prefix: str) -> Iterator[Path]:
 def read_bytes(path: str | Path, *, limit: int) -> bytes:
     """Read a regular file of at most `limit` bytes; SlamError for a larger one and for a device or a pipe, which may never end."""
     with open_regular(path) as file:
-        data = file.read(limit + 1)
-    if len(data) > limit:
+        size = os.fstat(file.fileno()).st_size
+        data = file.read(size + 1) if size <= limit else b""  # reserves at once what it is asked for
+    if max(size, len(data)) > limit:
         raise SlamError(f"{path}: too large; such a file has at most {limit} bytes")
     return data
 
@@ -210,6 +214,28 @@ def read_json(path: Path) -> dict[str, Any]:
     return _parse_json(path, _read_json_text(path))
 
 
+def parse_toml(data: bytes, *, source: str) -> dict[str, Any]:
+    """Parse TOML from outside; SlamError names `source`. Keys of many parts are refused: the parser's memory grows with their square."""
+    try:
+        text = data.decode("utf-8-sig")
+        longest = max((piece.count(".") for piece in re.split(r"[\n,=\[\]{}]", text)), default=0)
+        if longest > MOST_DOTS:
+            raise SlamError(f"{source}: not a configuration: a key of {longest} parts")
+        return tomllib.loads(text)
+    except (ValueError, RecursionError) as error:  # of encoding, of syntax, of numbers with thousands of digits
+        raise SlamError(f"{source}: not valid TOML: {error}") from error
+
+
+def user_path(text: str | Path) -> Path:
+    """Expand `~`; SlamError for a home that is not there and for a name that no file can have."""
+    try:
+        path = Path(text).expanduser()
+        path.is_file()  # whatever the answer: a NUL byte or a name too long to ask about is found here
+    except (RuntimeError, ValueError, OSError) as error:
+        raise SlamError(f"{str(text)[:LONGEST_NAME]!r}: not the name of a file ({error})") from error
+    return path
+
+
 def _read_json_text(path: Path) -> str:
     try:
         return read_bytes(path, limit=LARGEST_JSON).decode("utf-8")
@@ -222,7 +248,7 @@ def _read_json_text(path: Path) -> str:
 def _parse_json(path: Path, text: str) -> dict[str, Any]:
     try:
         value = json.loads(text)
-    except (ValueError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:  # of numbers with thousands of digits too
         raise SlamError(f"{path}: not valid JSON") from error
     if not isinstance(value, dict):
         raise SlamError(f"{path}: not a JSON object")

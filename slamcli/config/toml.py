@@ -3,7 +3,6 @@
 import dataclasses
 import difflib
 import math
-import tomllib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, get_args, get_origin, get_type_hints
@@ -15,6 +14,8 @@ from slamcli.errors import SlamError
 Settings = Mapping[str, Any] | Iterable[str]  # values by full name, or the texts that follow -s
 
 LARGEST_FILE = 1 << 20  # bytes; ours have about ten thousand
+LARGEST_NUMBER = 1 << 62  # of a whole number: what arrays can hold
+LONGEST_SHOWN = 80  # characters of a key or a value in a message
 COMPARISONS = {
     "ge": (">=", lambda value, bound: value >= bound),
     "gt": (">", lambda value, bound: value > bound),
@@ -38,7 +39,7 @@ def _shipped_folder() -> Path:
 
 def find(name_or_file: str) -> Path:
     """Find the file that `--config` means: a file, else one of `shipped()`."""
-    path = Path(name_or_file).expanduser()
+    path = files.user_path(name_or_file)
     if path.is_file():
         return path
     if name_or_file in shipped():
@@ -57,11 +58,7 @@ def read(path: Path, base: Config | None = None) -> Config:
 
 def parse(text: bytes, base: Config | None = None, *, source: str) -> Config:
     """Merge TOML over `base` (the defaults); SlamError names `source` and the key at fault."""
-    try:
-        values = tomllib.loads(text.decode("utf-8"))
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError) as error:
-        raise SlamError(f"{source}: not valid TOML: {error}") from error
-    return merge(base or Config(), values, source=source)
+    return merge(base or Config(), files.parse_toml(text, source=source), source=source)
 
 
 def merge(base: Config, values: Mapping[str, Any], *, source: str) -> Config:
@@ -97,8 +94,8 @@ def apply(base: Config, assignments: Iterable[str]) -> Config:
 
 def _parse(text: str) -> Any:
     try:
-        parsed = tomllib.loads(f"value = {text}")
-    except (tomllib.TOMLDecodeError, RecursionError):
+        parsed = files.parse_toml(f"value = {text}".encode(errors="replace"), source="-s")
+    except SlamError:
         return text
     return parsed["value"] if len(parsed) == 1 else text
 
@@ -147,7 +144,7 @@ def _unknown(key: str, source: str) -> SlamError:
         near = difflib.get_close_matches(key, near, n=1, cutoff=0.0)
     near = near or difflib.get_close_matches(key, known, n=1, cutoff=0.6)
     hint = f"did you mean {' or '.join(near)}?" if near else "see: slamcli config --explain"
-    return SlamError(f"{source}: {key} is not known; {hint}")
+    return SlamError(f"{source}: {key[:LONGEST_SHOWN]} is not known; {hint}")
 
 
 def _camera_value(key: str, value: Any, source: str) -> float | str:
@@ -172,17 +169,25 @@ def _value(section: type, section_name: str, key: str, value: Any, source: str) 
     if meta["choices"] and value not in meta["choices"]:
         raise SlamError(f"{origin}: must be one of {', '.join(map(str, meta['choices']))} ({meta['help']})")
     if meta["is_file"] and value:
-        value = str(Path(value).expanduser().resolve())
+        value = str(files.user_path(value).resolve())
     return value
 
 
 def _origin(name: str, value: Any, source: str) -> str:
-    return source if source.startswith("-s ") else f"{source}: {name} = {_toml(value)}"
+    if source.startswith("-s "):
+        return source
+    try:
+        shown = _toml(value)
+    except (ValueError, RecursionError):  # thousands of digits, or of brackets
+        shown = "..."
+    return f"{source}: {name} = {shown if len(shown) <= LONGEST_SHOWN else shown[:LONGEST_SHOWN] + '...'}"
 
 
 def _typed(expected: Any, value: Any, origin: str) -> Any:
     if get_origin(expected) is tuple:
         return _typed_tuple(get_args(expected), value, origin)
+    if isinstance(value, int) and abs(value) > LARGEST_NUMBER:
+        raise SlamError(f"{origin}: too large a number")
     if expected is float and isinstance(value, int) and not isinstance(value, bool):
         value = float(value)
     if type(value) is not expected or (expected is float and not math.isfinite(value)):

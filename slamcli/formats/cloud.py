@@ -18,6 +18,12 @@ PLY_TYPE = {
 PLY_NAME = {"f4": "float", "u1": "uchar"}
 MAX_HEADER = 65536  # bytes
 MAX_POINTS = 1 << 30
+MAX_NUMBER = 64  # bytes of a number in a text file, with what separates it from the next
+PCD_KINDS = {
+    "F": {"4": "f4", "8": "f8"},
+    "U": {"1": "u1", "2": "u2", "4": "u4", "8": "u8"},
+    "I": {"1": "i1", "2": "i2", "4": "i4", "8": "i8"},
+}
 
 
 def write(path: Path, xyz: np.ndarray, rgb: np.ndarray | None = None, normal: np.ndarray | None = None) -> None:
@@ -78,7 +84,7 @@ def _ply_header(vertex: np.ndarray, *, n_faces: int | None) -> bytes:
 
 def read_ply(path: Path) -> Points:
     """Read the vertices of an ASCII or binary PLY file; SlamError for one that is not what its header says."""
-    with open(path, "rb") as file:
+    with files.open_regular(path) as file:
         layout, dtype, n = _read_ply_header(path, file)
         if layout == "ascii":
             return _points(path, _read_text(path, file, dtype, n))
@@ -137,13 +143,13 @@ def write_pcd(path: Path, xyz: np.ndarray, rgb: np.ndarray | None = None, normal
 
 def read_pcd(path: Path) -> Points:
     """Read an ASCII or binary PCD file; SlamError for one that is not what its header says."""
-    with open(path, "rb") as file:
+    with files.open_regular(path) as file:
         lines = _header_lines(path, file, first="", last="DATA", kind="PCD")
         header = {words[0]: words[1:] for words in lines}
         names = header.get("FIELDS", [])
-        kinds = ["".join(pair) for pair in zip(_letters(header.get("TYPE", [])), header.get("SIZE", []), strict=False)]
+        kinds = [PCD_KINDS.get(kind, {}).get(size, "") for kind, size in zip(header.get("TYPE", []), header.get("SIZE", []), strict=False)]
         counts = header.get("COUNT", ["1"] * len(names))
-        if not names or len(kinds) != len(names) or counts != ["1"] * len(names):
+        if not names or len(kinds) != len(names) or not all(kinds) or counts != ["1"] * len(names):
             raise SlamError(f"{path}: the PCD header's FIELDS, SIZE, TYPE and COUNT do not describe single numbers")
         n = _count(path, " ".join(header.get("POINTS", [])), "points")
         layout = " ".join(header["DATA"])
@@ -153,10 +159,6 @@ def read_pcd(path: Path) -> Points:
         if layout != "binary":
             raise SlamError(f"{path}: PCD data of type {layout[:40]!r} cannot be read; convert it with: pcl_convert_pcd_ascii_binary")
         return _points(path, _read_records(path, file, dtype, n))
-
-
-def _letters(types: list[str]) -> list[str]:
-    return [{"F": "f", "U": "u", "I": "i"}.get(letter, "?") for letter in types]
 
 
 def _header_lines(path: Path, file: BinaryIO, *, first: str, last: str, kind: str) -> list[list[str]]:
@@ -177,7 +179,7 @@ def _header_lines(path: Path, file: BinaryIO, *, first: str, last: str, kind: st
 
 
 def _count(path: Path, text: str, what: str) -> int:
-    if not text.isdecimal() or int(text) > MAX_POINTS:
+    if not (text.isascii() and text.isdigit() and len(text) <= 12) or int(text) > MAX_POINTS:
         raise SlamError(f"{path}: the header gives {text[:40]!r} as the number of {what}")
     return int(text)
 
@@ -207,7 +209,8 @@ def _read_records(path: Path, file: BinaryIO, dtype: np.dtype, n: int) -> dict[s
 
 
 def _read_text(path: Path, file: BinaryIO, dtype: np.dtype, n: int) -> dict[str, np.ndarray]:
-    words, names = file.read().split(), _names(dtype)
+    names = _names(dtype)
+    words = file.read(n * len(names) * MAX_NUMBER).split()
     if n * len(names) > len(words):
         raise SlamError(f"{path}: is cut off: {n} points need {n * len(names)} numbers, {len(words)} are there")
     try:

@@ -39,7 +39,7 @@ def read(path: str | Path) -> Tree:
         size = path.stat().st_size
         if size > MAX_BYTES:
             raise SlamError(f"{path}: {size >> 20} MB is too large for a vocabulary (at most {MAX_BYTES >> 20} MB)")
-        with path.open("rb") as file:
+        with files.open_regular(path) as file:
             branching, depth = _header(file.readline(256), path)
             tables = []
             for table in _blocks(file, path):
@@ -123,6 +123,11 @@ def _tree(table: np.ndarray, branching: int, depth: int, path: Path) -> Tree:
     ):
         if is_wrong.any():
             raise SlamError(f"{path}: line {int(np.argmax(is_wrong)) + 2}: {fault}")
+    ancestor = parent.astype(np.int64)
+    for _ in range(depth - 1):  # the root's children have reached it, their children do in the next round, and so on
+        ancestor = np.concatenate([[0], parent.astype(np.int64)])[ancestor]
+    if ancestor.any():
+        raise SlamError(f"{path}: line {int(np.argmax(ancestor > 0)) + 2}: deeper than the {depth} levels that line 1 says")
     n_children = np.bincount(parent.astype(np.int64), minlength=len(table) + 1)
     if n_children.max() > branching:
         raise SlamError(f"{path}: node {int(n_children.argmax())} has {n_children.max()} children; line 1 says {branching} at most")

@@ -11,6 +11,8 @@ from slamcli.geometry import se3
 from slamcli.geometry.g2o_convention import from_g2o_information, to_g2o_information
 
 MAX_LINES = 5_000_000  # of a file read
+LONGEST_LINE = 4096  # bytes; an edge has some 600
+LARGEST = {"id": 1 << 62, "number": 1e150}  # whose square is still finite
 COLUMNS = {"VERTEX_SE3:QUAT": (1, 7), "EDGE_SE3:QUAT": (2, 28), "FIX": (1, 0)}  # whole numbers, real numbers
 
 
@@ -45,11 +47,11 @@ def read_g2o(path: Path) -> PoseGraph:
     """Read the SE(3) vertices and edges of a g2o text file; other lines are skipped. SlamError names file and line of what is wrong."""
     vertices, edges, fixed = {}, [], set()
     try:
-        with Path(path).open(encoding="ascii") as file:
-            for number, line in enumerate(file, start=1):
-                if number > MAX_LINES:
-                    raise SlamError(f"{path}: more than {MAX_LINES} lines; not a pose graph this program would read")
-                words = line.split()
+        with files.open_regular(path) as file:
+            for number, line in enumerate(iter(lambda: file.readline(LONGEST_LINE), b""), start=1):
+                if number > MAX_LINES or len(line) == LONGEST_LINE:
+                    raise SlamError(f"{path}: more than {MAX_LINES} lines, or one too long; not a pose graph this program would read")
+                words = line.decode("ascii").split()
                 if not words or words[0] not in COLUMNS:
                     continue
                 values = _parse(words, f"{path}:{number}")
@@ -93,8 +95,10 @@ def _parse(words: list[str], where: str) -> list:
         values = [*map(int, words[1 : 1 + n_ids]), *map(float, words[1 + n_ids :])]
     except ValueError:
         raise SlamError(f"{where}: {words[0]} holds something that is not a number") from None
-    if not np.isfinite(values[n_ids:]).all():
-        raise SlamError(f"{where}: {words[0]} holds a number that is not finite")
+    if any(abs(name) > LARGEST["id"] for name in values[:n_ids]):
+        raise SlamError(f"{where}: {words[0]} names a vertex beyond all that can be counted")
+    if not (np.abs(values[n_ids:]) <= LARGEST["number"]).all():
+        raise SlamError(f"{where}: {words[0]} holds a number that is not finite, or as good as")
     if n_values and not 0.5 < np.linalg.norm(values[n_ids + 3 : n_ids + 7]) < 2.0:
         raise SlamError(f"{where}: {words[0]} has a rotation that is not a unit quaternion")
     return values

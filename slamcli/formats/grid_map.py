@@ -88,20 +88,19 @@ def read(path: Path) -> GridMap:
         raise SlamError(f"{path}: mode {keys['mode']!r} cannot be read, only trinary")
     if Path(keys["image"]).name != keys["image"]:
         raise SlamError(f"{path}: image {keys['image']!r}: must be the name of a file in the same folder")
-    picture = read_pgm(path.parent / keys["image"]).astype(np.float64)
-    occupied = picture / 255.0 if _number(path, keys, "negate") else (255.0 - picture) / 255.0
-    state = np.full(picture.shape, UNKNOWN, dtype=np.int8)
-    state[occupied > occupied_thresh] = OCCUPIED
-    state[occupied < free_thresh] = FREE
+    grey = np.arange(256, dtype=np.float64)
+    occupied = grey / 255.0 if _number(path, keys, "negate") else (255.0 - grey) / 255.0
+    state_of = np.full(256, UNKNOWN, dtype=np.int8)
+    state_of[occupied > occupied_thresh] = OCCUPIED
+    state_of[occupied < free_thresh] = FREE
+    state = state_of[read_pgm(path.parent / keys["image"])]
     return GridMap(np.ascontiguousarray(state[::-1]), (origin[0], origin[1]), resolution)
 
 
 def _page(path: Path) -> dict[str, str]:
     """Read the page's `key: value` lines; values stay text. No YAML beyond that is used in such pages."""
     try:
-        if path.stat().st_size > MAX_PAGE:
-            raise SlamError(f"{path}: too long to be the page of a grid map")
-        lines = path.read_text(encoding="utf-8").splitlines()
+        lines = files.read_bytes(path, limit=MAX_PAGE).decode("utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise SlamError(f"{path}: cannot be read as the page of a grid map; name the .yaml file") from error
     keys = {"mode": "trinary", "negate": "0"}
@@ -135,7 +134,7 @@ def _as_number(path: Path, name: str, text: str) -> float:
 def read_pgm(path: Path) -> np.ndarray:
     """Read a binary PGM of 8 bits as (H, W) uint8, row 0 at the top."""
     try:
-        with open(path, "rb") as file:
+        with files.open_regular(path) as file:
             head = file.read(4096)
             words = [word for word in PGM_WORD.finditer(head) if not word[0].startswith(b"#")][:4]
             if len(words) < 4 or words[0][0] != b"P5" or words[3][0] != b"255" or not all(w[0].isdigit() for w in words[1:]):

@@ -104,7 +104,7 @@ def read(path: Path) -> Octree:
 
     Colours are passed over. Raises SlamError for a file that is not what its header says; memory is bounded by the size of the file.
     """
-    with open(path, "rb") as file:
+    with files.open_regular(path) as file:
         suffix, kind, size, resolution = _read_header(path, file)
         data = file.read()
     node = COLOUR_NODE if kind == "ColorOcTree" else NODE
@@ -165,7 +165,7 @@ def _number(path: Path, values: dict[str, str], name: str, kind: type, low: floa
     except ValueError:
         raise SlamError(f"{path}: the header's {name} is {values[name][:40]!r}, not a number; write the file again") from None
     if not low <= value <= high:
-        raise SlamError(f"{path}: the header's {name} is {value:g}, which cannot be; write the file again")
+        raise SlamError(f"{path}: the header's {name} is {values[name][:40]}, which cannot be; write the file again")
     return value
 
 

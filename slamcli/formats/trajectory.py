@@ -15,6 +15,8 @@ from slamcli.schema import Trajectory
 
 MAX_BYTES = 1 << 30  # some 10 million poses; a larger file is not a trajectory
 COLUMNS = 8
+SHORTEST = 1e-12  # squared length of a quaternion
+FARTHEST = 1e15  # m, s
 
 
 def read_tum(path: str | Path) -> Trajectory:
@@ -48,9 +50,7 @@ def write_kitti(path: str | Path, trajectory: Trajectory) -> None:
 def _data_lines(path: Path) -> list[tuple[int, str]]:
     """Give (line number, text) of the lines that hold data."""
     try:
-        if path.stat().st_size > MAX_BYTES:
-            raise SlamError(f"{path}: larger than {MAX_BYTES >> 30} GiB, which no trajectory is")
-        text = path.read_text(encoding="utf-8", errors="replace")
+        text = files.read_bytes(path, limit=MAX_BYTES).decode("utf-8", errors="replace")
     except OSError as error:
         raise SlamError(f"{path}: cannot be read ({error.strerror})") from error
     lines = enumerate(text.replace("\ufeff", "").splitlines(), start=1)
@@ -67,6 +67,8 @@ def _parse(path: Path, number: int, line: str) -> list[float]:
         raise SlamError(f"{path}:{number}: not a number in {line.strip()[:80]!r}") from None
     if not np.isfinite(row).all():
         raise SlamError(f"{path}:{number}: NaN or infinite; leave out poses that are not known")
-    if sum(q * q for q in row[4:]) < 1e-12:
-        raise SlamError(f"{path}:{number}: the quaternion has length 0")
+    if not SHORTEST < sum(q * q for q in row[4:]) < 1.0 / SHORTEST:
+        raise SlamError(f"{path}:{number}: the quaternion has length 0, or none that can be told")
+    if max(abs(x) for x in row[:4]) > FARTHEST:
+        raise SlamError(f"{path}:{number}: {line.strip()[:80]!r} holds a stamp or a place that no camera can have")
     return row

@@ -13,11 +13,13 @@ from numba import f4, f8, i4, i8, u8
 
 from slamcli import files
 from slamcli.errors import SlamError
+from slamcli.files import open_regular
 from slamcli.geometry.bits import hamming
 from slamcli.jit.kernel import kernel
 
 FORMAT = 1
 MAX_NODES = 4_000_000  # ORB-SLAM's vocabulary has 1.1 million
+MAX_DEPTH = 64  # levels below the root: a descriptor takes them all, one by one
 SHIPPED = Path(__file__).resolve().parent.parent / "data" / "vocabulary.npz"
 _FILE_ARRAYS = {"format": ("i4", 0), "centre": ("u1", 2), "first_child": ("i4", 1), "idf": ("f4", 1), "origin": ("u1", 1)}
 
@@ -101,12 +103,22 @@ def check(vocabulary: Vocabulary, *, source: str) -> Vocabulary:
     is_tree = len(first) == n + 1 and first[0] == 1 and first[-1] == n and (np.diff(first) >= 0).all()
     if not is_tree or not (first[1:-1] > np.arange(1, n)).all():
         raise SlamError(f"{source}: the nodes of this vocabulary are no tree; make it anew with: slamcli vocab train")
+    if _depth(first) > MAX_DEPTH:
+        raise SlamError(f"{source}: the tree of this vocabulary has more than {MAX_DEPTH} levels")
     n_words = int((np.diff(first) == 0).sum())
     if len(vocabulary.idf) != n_words:
         raise SlamError(f"{source}: {len(vocabulary.idf)} weights for {n_words} words; make it anew with: slamcli vocab train")
     if not (np.isfinite(vocabulary.idf).all() and (vocabulary.idf >= 0).all()):
         raise SlamError(f"{source}: a word's weight is negative or not a number; make it anew with: slamcli vocab train")
     return vocabulary
+
+
+def _depth(first_child: np.ndarray) -> int:
+    """Count the levels below the root, up to one more than are allowed."""
+    start, stop, depth = 0, 1, -1
+    while stop > start and depth <= MAX_DEPTH:
+        start, stop, depth = int(first_child[start]), int(first_child[stop]), depth + 1
+    return depth
 
 
 def save(path: str | Path, vocabulary: Vocabulary) -> None:
@@ -135,7 +147,9 @@ def _load(path: Path, _mtime_ns: int, _size: int) -> Vocabulary:
         columns = _read_arrays(path)
     except OSError as error:
         raise SlamError(f"{path}: the vocabulary cannot be read ({error.strerror or error}); make one with: slamcli vocab train") from error
-    except (ValueError, EOFError, zipfile.BadZipFile, NotImplementedError) as error:
+    except SlamError:
+        raise
+    except Exception as error:  # what zipfile, its decompressors and numpy's header raise is not declared anywhere
         raise SlamError(f"{path}: not a vocabulary of slamcli ({error}); text files of DBoW2 come in by: slamcli vocab import") from error
     vocabulary = Vocabulary(columns["centre"], columns["first_child"], columns["idf"], columns["origin"].tobytes().decode(errors="replace"))
     return check(vocabulary, source=str(path))
@@ -144,7 +158,7 @@ def _load(path: Path, _mtime_ns: int, _size: int) -> Vocabulary:
 def _read_arrays(path: Path) -> dict[str, np.ndarray]:
     """Read the arrays of the file, each checked for type and size before memory is reserved."""
     columns = {}
-    with zipfile.ZipFile(path) as archive:
+    with open_regular(path) as file, zipfile.ZipFile(file) as archive:
         for name, (dtype, n_axes) in _FILE_ARRAYS.items():
             try:
                 member = archive.open(name + ".npy")
