@@ -9,6 +9,7 @@ ASSUMED_RATE = 30.0  # [Hz] of recordings without a clock
 UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 EPOCH = (5e8, 4.3e9)  # [s] since 1970 of any recording: 1985 to 2106
 FASTEST = 1e-3  # [s] between frames of any camera, at least
+SLOWEST = 3600.0  # [s] between frames, likewise at most
 SLOWEST_STEP = 3.0  # a median step of more than this many of a unit belongs to the next smaller unit
 MANY_REPEATED = 0.2  # share of the steps without any advance from which stamps are no clock
 MANY_BACK = 0.1  # share of the steps backwards, likewise
@@ -19,6 +20,7 @@ INTERLEAVED = 5  # frames of one session between those of another that sorting w
 SESSION_PAUSE = 1.0  # [s] put between sessions whose clocks began anew
 LARGEST_NUMBER_STEP = 10  # frame numbers advance by this at most
 RATES = (1.0, 300.0)  # [Hz] that whole seconds may show
+NEAR_ROLL_OVER = 2.5  # steps from the top, and to the bottom, within which a counter rolls over
 ROLL_OVERS = (*(float(1 << bits) for bits in (8, 16, 24, 31, 32)), 60.0, 1000.0, 3600.0, 86400.0, 1e6, 1e9)
 
 
@@ -127,9 +129,10 @@ def _repeated(raw: np.ndarray, what: str, fps: float | None) -> Clock:
 
 
 def _unit_of_epoch(raw: np.ndarray) -> str | None:
-    """Give the unit under which stamps are dates of our time."""
-    middle = float(np.median(raw))
-    return next((unit for unit, factor in UNITS.items() if EPOCH[0] <= middle * factor <= EPOCH[1]), None)
+    """Give the unit under which stamps are dates of our time, and their steps those of a camera."""
+    middle, step = float(np.median(raw)), np.diff(np.unique(raw))
+    typical = float(np.median(step)) if len(step) else 0.0
+    return next((unit for unit, factor in UNITS.items() if EPOCH[0] <= middle * factor <= EPOCH[1] and typical * factor < SLOWEST), None)
 
 
 def _unit(raw: np.ndarray) -> tuple[str, bool]:
@@ -169,10 +172,10 @@ def _unrolled(raw: np.ndarray) -> np.ndarray | None:
     forward, back = step[step > 0], np.flatnonzero(step < 0)
     if len(forward) < ENOUGH:
         return None
-    near = 10.0 * float(np.median(forward))
+    near = NEAR_ROLL_OVER * float(np.median(forward))
     for modulus in (period * factor for period in ROLL_OVERS for factor in UNITS.values()):
         at_top, at_bottom = raw[back] >= modulus - near, raw[back + 1] < near
-        if at_top.all() and at_bottom.all() and (raw < modulus).all() and modulus > 2 * near:
+        if at_top.all() and at_bottom.all() and (raw < modulus).all() and modulus > 10 * near:
             turns = np.zeros(len(raw))
             turns[back + 1] = 1.0
             return raw + modulus * np.cumsum(turns)
