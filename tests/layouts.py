@@ -349,9 +349,11 @@ def write_ros(
     skip: tuple[str, ...] = (),
 ) -> None:
     """Write colour, depth, CameraInfo and tf by the definitions that rosbags ships: not by the reader's own parser."""
-    from rosbags.typesys import Stores, get_typestore
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     store = get_typestore(Stores.ROS2_HUMBLE if is_cdr else Stores.ROS1_NOETIC)
+    if "tf2_msgs/msg/TFMessage" not in store.types:
+        store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
     types = store.types
     serialize = store.serialize_cdr if is_cdr else store.serialize_ros1
 
