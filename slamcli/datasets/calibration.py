@@ -87,7 +87,8 @@ def complete(
     is_known = all(key in CAMERA_KEYS for key in values)  # else the camera names the key at fault
     missing = [key for key in NEEDED if key not in values] if is_known else []
     if missing:
-        what = f"{root}: no calibration" if not source else f"{source}: the calibration is not whole"
+        told = source if str(root) in source else f"{root}: {source}"
+        what = f"{root}: no calibration" if not calibration.source else f"{told}: the calibration is not whole"
         raise SlamError(
             f"{what}: {', '.join(missing)} {'are' if len(missing) > 1 else 'is'} missing; put them into a camera.toml {_place(root)}, set them by "
             f"-s camera.{missing[0]}=... and so on, or name the camera: --camera {'|'.join(NOMINAL)}"
