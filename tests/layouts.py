@@ -490,7 +490,7 @@ LAYOUTS = (
     Layout("rtabmap", rtabmap, "rtabmap", keeps_depth_stamps=False),
     Layout("transforms", transforms, "transforms", keeps_depth_stamps=False, override=UNIT_KEPT),
     Layout("r3d", r3d, "r3d", keeps_depth_stamps=False, override=UNIT_KEPT, needs=("liblzfse",)),
-    Layout("sens", sens, "sens", keeps_depth_stamps=False, override=UNIT_KEPT),
+    Layout("sens", sens, "sens", override=UNIT_KEPT),
     Layout("rtabmap_db", rtabmap_db, "rtabmap_db", keeps_depth_stamps=False),
     Layout("rtabmap_db_rvl", _ros(rtabmap_db, use_rvl=True), "rtabmap_db", keeps_depth_stamps=False),
     Layout("ros1_compressed", ros1, "rosbag", override=UNIT_KEPT),

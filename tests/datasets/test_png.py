@@ -98,7 +98,9 @@ def test_mixed_filters_give_what_opencv_gives(seed: int, kinds: list[int], width
 def test_a_whole_file_is_grey_as_by_opencv(tmp_path: Path, kind: int) -> None:
     image = colour(48, 64, seed=kind)
     (tmp_path / "image.png").write_bytes(encoded(image, [kind] * 48))
-    assert np.array_equal(images.decode_grey(images.read_bytes(tmp_path / "image.png"), (64, 48), name="image.png"), cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
+    assert np.array_equal(
+        images.decode_grey(images.read_bytes(tmp_path / "image.png"), (64, 48), name="image.png"), cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    )
 
 
 def test_chunks_that_change_no_pixel_are_passed_over() -> None:

@@ -78,7 +78,7 @@ def test_stamps_are_kept_bit_for_bit_where_the_layout_has_them(written: tuple[La
     dataset = opened(layout, path)
     if layout.keeps_stamps:
         true = np.array([float(layouts.seconds(stamp)) for stamp in content.stamp])
-        assert np.array_equal(dataset.stamp, true) if layout.name != "sens" else np.allclose(dataset.stamp, true, atol=1e-6)
+        assert np.array_equal(dataset.stamp, true)
         offset = 0.004 if layout.keeps_depth_stamps else 0.0
         np.testing.assert_allclose(dataset.depth_stamp - dataset.stamp, offset, atol=1e-6)
     else:
