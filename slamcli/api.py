@@ -9,7 +9,7 @@ Nothing is printed: progress goes to the `progress` of the caller, single lines 
 
 import logging
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -48,6 +48,7 @@ def run(
     force: bool = False,
     progress: Progress = silent,
     tell: Tell = log.info,
+    look: "Callable[[Dataset], None] | None" = None,
 ) -> "Run":
     """Make a run of a recording, or bring the one that is there up to date: exactly the stages that need it.
 
@@ -58,10 +59,13 @@ def run(
     data : folder of recordings to look in first
     start, until, force : run from this stage on whether up to date or not; stop after this one; run every stage
     progress : passes items through under a bar, as ``progress(items, label, total=None)``; tell : takes single lines
+    look : is given the recording before its first stage runs, to say what is wrong with it
 
     Raises SlamError for whatever the caller can mend, such as a recording that is not there or an option that is not known.
     """
     opened, dataset, resolved = _create(str(target), settings, config, path, data, progress)
+    if look is not None and not Pipeline(opened, resolved, dataset=dataset).states()[NAMES[0]].is_fresh:
+        look(dataset)
     _bring_up_to_date(opened, resolved, dataset, start=start, until=until, force=force, progress=progress, tell=tell)
     return Run(opened)
 
@@ -226,7 +230,7 @@ def _create(
     from slamcli.datasets import open_dataset
 
     def opened(resolved: Config) -> "Dataset":
-        return open_dataset(target, data=data, camera=dict(resolved.camera) or None, progress=progress)
+        return open_dataset(target, data=data, camera=dict(resolved.camera) or None, options=resolved.recording, progress=progress)
 
     settings = settings if isinstance(settings, Mapping) else tuple(settings)
     if path is not None:
@@ -236,7 +240,7 @@ def _create(
     place = Path(path) if path is not None else default_path(dataset.name)
     RunDir(place).restore()
     resolved = toml.resolve(RunDir(place).config(), config, settings)
-    if resolved.camera != first.camera:  # only now is it known that an earlier command gave this run another camera
+    if (resolved.camera, resolved.recording) != (first.camera, first.recording):  # as an earlier command said; it is only known now
         dataset = opened(resolved)
     directory = RunDir.create(place, dataset=dataset.name, root=str(dataset.root.resolve()), digest=dataset.digest())
     return directory, dataset, resolved

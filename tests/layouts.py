@@ -276,32 +276,23 @@ def rtabmap_db(content: Content, out: Path, *, use_rvl: bool = False) -> Path:
 
 
 def rvl(raw: np.ndarray) -> bytes:
-    """The encoder of the paper, one value after another."""
-    values, nibbles = raw.ravel().astype(int).tolist(), []
-
-    def put(value: int) -> None:
-        while True:
-            nibble, value = value & 7, value >> 3
-            nibbles.append(nibble | 8 if value else nibble)
-            if not value:
-                return
-
-    at, previous = 0, 0
-    while at < len(values):
-        start = at
-        while at < len(values) and values[at] == 0:
-            at += 1
-        put(at - start)
-        start = at
-        while at < len(values) and values[at] != 0:
-            at += 1
-        put(at - start)
-        for value in values[start:at]:
-            delta = value - previous
-            put((delta << 1) ^ (delta >> 31))
-            previous = value
-    nibbles += [0] * (-len(nibbles) % 8)
-    words = np.array(nibbles, dtype=np.uint64).reshape(-1, 8)
+    """The encoder of the paper, over whole arrays."""
+    values = raw.ravel().astype(np.int64)
+    is_value = np.concatenate([[False], values > 0, [False]])
+    starts, ends = np.flatnonzero(~is_value[:-1] & is_value[1:]), np.flatnonzero(is_value[:-1] & ~is_value[1:])
+    delta = np.diff(values[values > 0], prepend=0)
+    code, at, done, tokens = (delta << 1) ^ (delta >> 63), 0, 0, []
+    for start, end in zip(starts, ends, strict=True):
+        tokens += [np.array([start - at, end - start]), code[done : done + end - start]]
+        at, done = end, done + end - start
+    if at < len(values):
+        tokens.append(np.array([len(values) - at, 0]))
+    numbers = np.concatenate(tokens)
+    n_nibbles = np.maximum(np.ceil(np.log2(numbers + 1.0) / 3 - 1e-12), 1).astype(np.int64)
+    place = np.arange(n_nibbles.sum()) - np.repeat(np.cumsum(n_nibbles) - n_nibbles, n_nibbles)
+    nibbles = (np.repeat(numbers, n_nibbles) >> (3 * place)) & 7
+    nibbles += 8 * (place < np.repeat(n_nibbles, n_nibbles) - 1)
+    words = np.concatenate([nibbles, np.zeros(-len(nibbles) % 8, np.int64)]).reshape(-1, 8).astype(np.uint64)
     packed = sum(words[:, k] << np.uint64(4 * (7 - k)) for k in range(8))
     return np.asarray(packed).astype("<u4").tobytes()
 
@@ -358,9 +349,11 @@ def write_ros(
     skip: tuple[str, ...] = (),
 ) -> None:
     """Write colour, depth, CameraInfo and tf by the definitions that rosbags ships: not by the reader's own parser."""
-    from rosbags.typesys import Stores, get_typestore
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     store = get_typestore(Stores.ROS2_HUMBLE if is_cdr else Stores.ROS1_NOETIC)
+    if "tf2_msgs/msg/TFMessage" not in store.types:
+        store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
     types = store.types
     serialize = store.serialize_cdr if is_cdr else store.serialize_ros1
 
@@ -497,7 +490,7 @@ LAYOUTS = (
     Layout("rtabmap", rtabmap, "rtabmap", keeps_depth_stamps=False),
     Layout("transforms", transforms, "transforms", keeps_depth_stamps=False, override=UNIT_KEPT),
     Layout("r3d", r3d, "r3d", keeps_depth_stamps=False, override=UNIT_KEPT, needs=("liblzfse",)),
-    Layout("sens", sens, "sens", keeps_depth_stamps=False, override=UNIT_KEPT),
+    Layout("sens", sens, "sens", override=UNIT_KEPT),
     Layout("rtabmap_db", rtabmap_db, "rtabmap_db", keeps_depth_stamps=False),
     Layout("rtabmap_db_rvl", _ros(rtabmap_db, use_rvl=True), "rtabmap_db", keeps_depth_stamps=False),
     Layout("ros1_compressed", ros1, "rosbag", override=UNIT_KEPT),

@@ -1,5 +1,6 @@
 """Options that several commands share."""
 
+import functools
 import math
 import os
 from collections.abc import Callable
@@ -9,6 +10,8 @@ from typing import Any, TypeVar
 import click
 
 Function = TypeVar("Function", bound=Callable[..., Any])
+
+SELECTION = ("start", "end", "every", "fps", "known_camera")  # options of the section `recording` that have a flag
 
 run_option = click.option("-r", "--run", metavar="DIR", help="The run directory. [default: $SLAMCLI_RUN, else runs/latest]")
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON for programs.")
@@ -84,3 +87,25 @@ def check_ending(out: Path, *endings: str) -> str:
     if out.suffix.lower() not in endings:
         raise SlamError(f"{out}: the name must end in {' or '.join(endings)}")
     return out.suffix.lower()
+
+
+def recording_options(function: Function) -> Function:
+    """Add the options that choose a part of a recording and fill in what it does not say; they arrive as `selection`, settings by name."""
+
+    @functools.wraps(function)
+    def wrapped(*args: Any, **values: Any) -> Any:
+        selection = {f"recording.{name}": value for name in SELECTION if (value := values.pop(f"recording_{name}")) is not None}
+        if "recording.known_camera" in selection:  # good to some per cent: the recording itself tells more
+            selection["optimize.intrinsics"] = True
+        return function(*args, selection=selection, **values)
+
+    options = (
+        click.option("--start", "recording_start", type=click.FloatRange(min=0), metavar="S", help="Begin S seconds after the first frame."),
+        click.option("--end", "recording_end", type=click.FloatRange(min=0), metavar="S", help="Stop S seconds after the first frame."),
+        click.option("--every", "recording_every", type=click.IntRange(min=1), metavar="N", help="Use every N-th frame."),
+        click.option("--fps", "recording_fps", type=click.FloatRange(min=0, min_open=True), metavar="HZ", help="Frame rate, where stamps are missing or no clock."),
+        click.option("--camera", "recording_known_camera", metavar="NAME", help="Nominal intrinsics of a known camera: kinect1, d435, azure ..."),
+    )  # fmt: skip
+    for option in reversed(options):
+        wrapped = option(wrapped)
+    return wrapped  # type: ignore[return-value]

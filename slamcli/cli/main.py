@@ -11,7 +11,19 @@ from slamcli.cli.common import verbose_option
 from slamcli.errors import SlamError
 
 LACKING = ("Cannot allocate", "failed to map", "start new thread", "load shared object")  # in the errors of libraries short of memory
-TOPICS = ("run", "evaluate", "export", "maps", "grid", "visualize", "localize", "simulate", "features", "vocab")  # modules of this package
+TOPICS = (
+    "run",
+    "evaluate",
+    "export",
+    "maps",
+    "grid",
+    "visualize",
+    "recordings",
+    "localize",
+    "simulate",
+    "features",
+    "vocab",
+)  # modules of this package
 
 
 class Group(click.Group):

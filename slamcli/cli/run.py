@@ -6,10 +6,11 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from slamcli.cli.common import config_option, json_option, run_option, set_option
+from slamcli.cli.common import config_option, json_option, recording_options, run_option, set_option
 from slamcli.stages import NAMES, STAGES, Stage
 
 if TYPE_CHECKING:
+    from slamcli.datasets import Dataset
     from slamcli.evaluation.map_verdict import Verdict
     from slamcli.runs.placement import Placement
     from slamcli.runs.run_directory import RunDir
@@ -22,6 +23,7 @@ STAGE = click.Choice(NAMES)
 @click.argument("target", required=False)
 @click.option("-r", "--run", metavar="DIR", help="Where the run goes. [default: $SLAMCLI_RUN, else runs/<recording>]")
 @click.option("--data", metavar="DIR", help="Where recordings lie. [default: $SLAMCLI_DATA, else ./data]")
+@recording_options
 @config_option
 @set_option
 @click.option("--from", "start", type=STAGE, help="Run this stage and those after it even if they are up to date.")
@@ -38,23 +40,30 @@ def run_command(
     until: str | None,
     force: bool,
     as_json: bool,
+    selection: dict[str, Any],
 ) -> None:
     """Bring a run up to date: exactly the stages that need it.
 
-    TARGET is a recording: `demo` for a simulated room, a folder, or a name such as `tum/fr1_room`, which is downloaded when it is not
-    found. Without TARGET an existing run goes on. Prints the run directory; with --json what was made and how good the map is.
+    TARGET is a recording: `demo` for a simulated room, a folder or file of any layout that `slamcli formats` lists, or a name such as
+    `tum/fr1_room`, which is downloaded when it is not found. Without TARGET an existing run goes on. Prints the run directory; with
+    --json what was made and how good the map is.
 
     \b
       slamcli run demo
       slamcli run tum/fr1_room -s extract.features=1500
       slamcli run path/to/recording -r runs/mine --config accurate
+      slamcli run walk.mcap --start 10 --end 60
     """
     from slamcli import api, console
 
     named = run or os.environ.get("SLAMCLI_RUN")
+    assignments = (*(f"{name}={json.dumps(value)}" for name, value in selection.items()), *assignments)
     options: dict[str, Any] = {"settings": assignments, "config": config_name, "start": start, "until": until, "force": force}
     options |= {"progress": console.progress, "tell": console.say}
-    done = api.open_run(named, restore=True).update(**options) if target is None else api.run(target, path=named, data=data, **options)
+    if target is None:
+        done = api.open_run(named, restore=True).update(**options)
+    else:
+        done = api.run(target, path=named, data=data, look=_look, **options)
     if as_json:
         click.echo(json.dumps(_made_object(done.directory), indent=1))
         return
@@ -103,6 +112,16 @@ def _made_object(rundir: "RunDir") -> dict[str, Any]:
         "map": verdict.to_dict() if verdict is not None else None,
         "next": summary.next_commands(rundir),
     }
+
+
+def _look(dataset: "Dataset") -> None:
+    """Say what a look at a few frames shows, before time is spent on the recording."""
+    import logging
+
+    from slamcli import inspection
+
+    for finding in inspection.quick_look(dataset):
+        logging.getLogger("slamcli").warning("%s: %s", dataset.root, "; ".join(filter(None, (finding.message, finding.advice))))
 
 
 def _stage_command(stage: Stage) -> click.Command:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from slamcli.cli.common import Target, json_option, run_option
+from slamcli.cli.common import Target, json_option, recording_options, run_option
 
 if TYPE_CHECKING:
     from slamcli.inspection import Inspection
@@ -23,16 +23,19 @@ BAR = 30  # characters of the longest bar in a histogram
 @click.option(
     "--depth-scale", type=click.FloatRange(min=0, min_open=True), help="Depth units per metre to assume instead of the recording's own."
 )
+@recording_options
 @json_option
-def inspect_command(recording: str, data: str | None, depth_scale: float | None, as_json: bool) -> None:
+def inspect_command(recording: str, data: str | None, depth_scale: float | None, as_json: bool, selection: dict[str, Any]) -> None:
     """Say what is wrong with a recording before time is spent on it.
 
     Every image is read once. Exit status 1 where a run would not make sense.
     """
     from slamcli import console, inspection
+    from slamcli.config import toml
 
     camera = {"depth_scale": depth_scale} if depth_scale is not None else None
-    found = inspection.inspect(recording, data=data, camera=camera, progress=console.progress)
+    options = toml.resolve(None, None, selection).recording
+    found = inspection.inspect(recording, data=data, camera=camera, options=options, progress=console.progress)
     click.echo(json.dumps(found.to_dict(), indent=1) if as_json else _as_text(found))
     if found.level == inspection.ERROR:
         click.get_current_context().exit(1)

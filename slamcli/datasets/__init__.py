@@ -46,7 +46,7 @@ def open_dataset(
     reader = reader_of(path)
     if reader is None:
         raise SlamError(_not_a_recording(path))
-    return assemble(reader.read(path), name=name, camera=camera, options=options)
+    return assemble(reader.layout.read(path), name=name, camera=camera, options=options)
 
 
 def _not_a_recording(path: Path) -> str:

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,10 +10,11 @@ import numpy as np
 from slamcli.config.options import RecordingConfig
 from slamcli.datasets import depth_unit, images
 from slamcli.datasets.calibration import DEFAULT_DEPTH_SCALE, Calibration, complete
+from slamcli.datasets.folder import IMAGE_SUFFIXES, Folder, subfolder
 from slamcli.datasets.pairing import pair, select
 from slamcli.datasets.recorded import Recorded
 from slamcli.datasets.recording import Recording, spread
-from slamcli.datasets.sources import Images, count_missing, depth_pixels, picture
+from slamcli.datasets.sources import ImageFiles, Images, count_missing, depth_pixels, picture
 from slamcli.errors import BadFrame, SlamError
 from slamcli.geometry.camera import SHAPE_TOLERANCE, Camera
 from slamcli.geometry.depth_registration import Registration
@@ -22,6 +24,7 @@ LARGE = 1_100_000  # pixels of a picture from which it is reduced,
 WORKING = 460_800  # to at most so many: 1.5 times 640 x 480
 ROUGHER = 8.0  # times by which neighbouring readings differ more than with their bytes swapped, where they are swapped
 STRETCHED = 257  # 8 bits stretched to 16 are multiples of this
+MASK_FOLDERS = ("masks", "mask")
 FLOAT_METRES = 100.0  # floating-point depth with a larger median is in millimetres
 
 
@@ -68,7 +71,7 @@ def assemble(found: Recorded, *, name: str, camera: dict[str, Any] | None = None
         depth_size=probe.size,
         reduction=reduction,
         registration=registration,
-        masks=found.masks,
+        masks=_masks(found),
         warnings=[*warnings, *_doubts_about_depth(found, working, probe)],
         read_ground_truth=lambda: found.truth(pairs.clock) if found.truth is not None else None,
     )
@@ -130,6 +133,15 @@ def _roughness(raw: np.ndarray) -> float:
     both = (raw[:, 1:] > 0) & (raw[:, :-1] > 0)
     step = np.abs(raw[:, 1:].astype(np.int32) - raw[:, :-1])[both]
     return float(np.median(step)) if len(step) else 0.0
+
+
+def _masks(found: Recorded) -> Images | None:
+    """Find a folder of masks, images of the names that the colour images have; None where there is none."""
+    home = subfolder(found.root, MASK_FOLDERS) if found.root.is_dir() else None
+    if home is None:
+        return None
+    of_stem = {Path(name).stem: f"{home}/{name}" for name in Folder(found.root).files(home) if Path(name).suffix.lower() in IMAGE_SUFFIXES}
+    return ImageFiles(found.root, [of_stem.get(Path(name).stem, "") for name in found.colour.images.names])
 
 
 def _depth_scale(found: Recorded, probe: _Probe, override: dict[str, Any] | None) -> tuple[float, list[str]]:

@@ -1,6 +1,6 @@
 """Where a recording's intrinsics come from: the user, a file in its folder, a camera's name, or the known cameras of the TUM data set."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ INTRINSICS_FILES = (
     "cam_K.txt", "camera_matrix.csv", "camera_info.yaml", "calibration.yaml", "calib.yaml", "camera.yaml", "intrinsics.yaml",
 )  # fmt: skip
 NEEDED = ("fx", "fy", "cx", "cy")
+CAMERA_KEYS = frozenset(field.name for field in fields(Camera))
 DEFAULT_DEPTH_SCALE = 1000.0  # millimetres: what nearly all recorders write
 OFF_CENTRE = 0.3  # share of a picture's side within which a principal point lies from the middle, if its size is right
 
@@ -83,15 +84,18 @@ def complete(
         source = f"camera {name}"
     if override:
         values, source = {**values, **override}, f"{source} with camera override" if source else "camera override"
-    missing = [key for key in NEEDED if key not in values]
-    if missing and not source:
+    is_known = all(key in CAMERA_KEYS for key in values)  # else the camera names the key at fault
+    missing = [key for key in NEEDED if key not in values] if is_known else []
+    if missing:
+        told = source if str(root) in source else f"{root}: {source}"
+        what = f"{root}: no calibration" if not calibration.source else f"{told}: the calibration is not whole"
         raise SlamError(
-            f"{root}: no calibration: {', '.join(missing)} are missing; put them into a camera.toml {_place(root)}, set them by "
-            f"-s camera.fx=... and so on, or name the camera: --camera {'|'.join(NOMINAL)}"
+            f"{what}: {', '.join(missing)} {'are' if len(missing) > 1 else 'is'} missing; put them into a camera.toml {_place(root)}, set them by "
+            f"-s camera.{missing[0]}=... and so on, or name the camera: --camera {'|'.join(NOMINAL)}"
         )
     if depth_scale is not None:
         values.setdefault("depth_scale", depth_scale)
-    if size is not None and "width" not in values and "height" not in values and not missing:
+    if size is not None and "width" not in values and "height" not in values and is_known:
         values = _sized(values, size, source)
     whole = {key: int(values[key]) for key in ("width", "height") if isinstance(values.get(key), float) and values[key].is_integer()}
     camera = Camera.from_dict({**values, **whole}, source=source if str(root) in source else f"{root}: {source}")

@@ -6,9 +6,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 ASSUMED_RATE = 30.0  # [Hz] of recordings without a clock
-UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+UNITS = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}  # of each in a second: a quotient of exact numbers is rounded once
 EPOCH = (5e8, 4.3e9)  # [s] since 1970 of any recording: 1985 to 2106
 FASTEST = 1e-3  # [s] between frames of any camera, at least
+SLOWEST = 3600.0  # [s] between frames, likewise at most
 SLOWEST_STEP = 3.0  # a median step of more than this many of a unit belongs to the next smaller unit
 MANY_REPEATED = 0.2  # share of the steps without any advance from which stamps are no clock
 MANY_BACK = 0.1  # share of the steps backwards, likewise
@@ -19,6 +20,7 @@ INTERLEAVED = 5  # frames of one session between those of another that sorting w
 SESSION_PAUSE = 1.0  # [s] put between sessions whose clocks began anew
 LARGEST_NUMBER_STEP = 10  # frame numbers advance by this at most
 RATES = (1.0, 300.0)  # [Hz] that whole seconds may show
+NEAR_ROLL_OVER = 2.5  # steps from the top, and to the bottom, within which a counter rolls over
 ROLL_OVERS = (*(float(1 << bits) for bits in (8, 16, 24, 31, 32)), 60.0, 1000.0, 3600.0, 86400.0, 1e6, 1e9)
 
 
@@ -58,24 +60,24 @@ def _judge(raw: np.ndarray, what: str, fps: float | None, shifts: tuple[float, .
     """Decide what finite stamps are."""
     n, step = len(raw), np.diff(raw)
     if n == 1:
-        factor = UNITS[_unit_of_epoch(raw) or "s"]
-        return Clock(raw * factor, np.zeros(1, dtype=np.int64), True, lambda other: other * factor)
+        per_second = UNITS[_unit_of_epoch(raw) or "s"]
+        return Clock(raw / per_second, np.zeros(1, dtype=np.int64), True, lambda other: other / per_second)
     if (step == 0).mean() > MANY_REPEATED:
         return _repeated(raw, what, fps)
     if _are_frame_numbers(raw):
         return _numbers(raw, what, fps)
     unit, is_plausible = _unit(raw)
-    factor = UNITS[unit]
-    seconds = raw if unit == "s" else raw * factor
+    per_second = UNITS[unit]
+    seconds = raw / per_second
     told = [f"{what}: stamps are in {unit}; read as such"] if unit != "s" else []
     back = int((step < 0).sum())
     if back == 0:
-        return _ordered(seconds, factor, what, told) if is_plausible else _assumed(n, fps, _hasty(what, seconds))
+        return _ordered(seconds, per_second, what, told) if is_plausible else _assumed(n, fps, _hasty(what, seconds))
     unrolled = _unrolled(raw)
     if unrolled is not None:
         kept = np.flatnonzero(np.concatenate([[True], np.diff(unrolled) > 0]))
         return Clock(
-            unrolled[kept] * factor, kept, True, None, [*told, f"{what}: the counter of the stamps rolled over {back} times; unrolled"]
+            unrolled[kept] / per_second, kept, True, None, [*told, f"{what}: the counter of the stamps rolled over {back} times; unrolled"]
         )
     stretches = _sessions(seconds)
     if stretches is not None:
@@ -83,10 +85,10 @@ def _judge(raw: np.ndarray, what: str, fps: float | None, shifts: tuple[float, .
     is_regular = _is_regular(raw)
     if (back > MANY_BACK * (n - 1) and n >= ENOUGH and not is_regular) or not is_plausible:
         return _assumed(n, fps, f"{what}: stamps go back {back} times and show no even pace, so they are no clock (processing times?)")
-    return _ordered(seconds, factor, what, told)
+    return _ordered(seconds, per_second, what, told)
 
 
-def _ordered(seconds: np.ndarray, factor: float, what: str, told: list[str]) -> Clock:
+def _ordered(seconds: np.ndarray, per_second: float, what: str, told: list[str]) -> Clock:
     """Sort stamps, and of those repeated keep the first."""
     back = int((np.diff(seconds) < 0).sum())
     if back:
@@ -96,7 +98,7 @@ def _ordered(seconds: np.ndarray, factor: float, what: str, told: list[str]) -> 
     if not is_first.all():
         told = [*told, f"{what}: {int((~is_first).sum())} repeated stamps; the first image of each is kept"]
     order = order[is_first]
-    return Clock(seconds[order], order, True, lambda other: other * factor if factor != 1.0 else other, told)
+    return Clock(seconds[order], order, True, lambda other: other / per_second, told)
 
 
 def _assumed(n: int, fps: float | None, why: str) -> Clock:
@@ -127,9 +129,12 @@ def _repeated(raw: np.ndarray, what: str, fps: float | None) -> Clock:
 
 
 def _unit_of_epoch(raw: np.ndarray) -> str | None:
-    """Give the unit under which stamps are dates of our time."""
-    middle = float(np.median(raw))
-    return next((unit for unit, factor in UNITS.items() if EPOCH[0] <= middle * factor <= EPOCH[1]), None)
+    """Give the unit under which stamps are dates of our time, and their steps those of a camera."""
+    middle, step = float(np.median(raw)), np.diff(np.unique(raw))
+    typical = float(np.median(step)) if len(step) else 0.0
+    return next(
+        (unit for unit, per_second in UNITS.items() if EPOCH[0] <= middle / per_second <= EPOCH[1] and typical / per_second < SLOWEST), None
+    )
 
 
 def _unit(raw: np.ndarray) -> tuple[str, bool]:
@@ -139,7 +144,7 @@ def _unit(raw: np.ndarray) -> tuple[str, bool]:
     unit = _unit_of_epoch(raw)
     if unit is None:
         unit = "s" if typical < SLOWEST_STEP else "ms" if typical < 1e3 * SLOWEST_STEP else "us" if typical < 1e6 * SLOWEST_STEP else "ns"
-    return unit, typical * UNITS[unit] >= FASTEST
+    return unit, typical / UNITS[unit] >= FASTEST
 
 
 def _hasty(what: str, seconds: np.ndarray) -> str:
@@ -169,10 +174,10 @@ def _unrolled(raw: np.ndarray) -> np.ndarray | None:
     forward, back = step[step > 0], np.flatnonzero(step < 0)
     if len(forward) < ENOUGH:
         return None
-    near = 10.0 * float(np.median(forward))
-    for modulus in (period * factor for period in ROLL_OVERS for factor in UNITS.values()):
+    near = NEAR_ROLL_OVER * float(np.median(forward))
+    for modulus in (period * unit for period in ROLL_OVERS for unit in (1.0, 1e-3, 1e-6, 1e-9)):
         at_top, at_bottom = raw[back] >= modulus - near, raw[back + 1] < near
-        if at_top.all() and at_bottom.all() and (raw < modulus).all() and modulus > 2 * near:
+        if at_top.all() and at_bottom.all() and (raw < modulus).all() and modulus > 10 * near:
             turns = np.zeros(len(raw))
             turns[back + 1] = 1.0
             return raw + modulus * np.cumsum(turns)

@@ -12,10 +12,15 @@ from slamcli.errors import SlamError
 
 MAX_LIST_BYTES = 256 << 20
 MAX_LINE = 4096  # characters; no line of a list is longer
-NUMBER = r"[+-]?(?:(?:\d+(?:[.,]\d*)?|[.]\d+)(?:[eE][+-]?\d+)?|nan|inf)"
-STAMP_FIRST = re.compile(rf"\s*[\"']?({NUMBER})[\"']?\s*[,;\s]\s*(.*\S)\s*$", re.IGNORECASE)
-STAMP_LAST = re.compile(rf"\s*(\S.*?)\s*[,;\s]\s*[\"']?({NUMBER})[\"']?\s*$", re.IGNORECASE)
-WHOLE_NUMBER = re.compile(rf"[\"']?({NUMBER})[\"']?$", re.IGNORECASE)
+NUMBER = r"[+-]?(?:(?:\d+(?:[.]\d*)?|[.]\d+)(?:[eE][+-]?\d+)?|nan|inf)"
+DECIMAL_COMMA = r"[+-]?\d+,\d+"
+# A comma within a number is a decimal comma where white space or a semicolon follows the number; else commas separate.
+STAMP_FIRST = (
+    re.compile(rf"\s*[\"']?({DECIMAL_COMMA})[\"']?\s*[;\s]\s*(.*\S)\s*$"),
+    re.compile(rf"\s*[\"']?({NUMBER})[\"']?\s*[,;\s]\s*(.*\S)\s*$", re.IGNORECASE),
+)
+STAMP_LAST = re.compile(rf"\s*(\S.*?)\s*[,;\s]\s*[\"']?({DECIMAL_COMMA}|{NUMBER})[\"']?\s*$", re.IGNORECASE)
+WHOLE_NUMBER = re.compile(rf"[\"']?({DECIMAL_COMMA}|{NUMBER})[\"']?$", re.IGNORECASE)
 POSE_COLUMNS = 8  # stamp tx ty tz qx qy qz qw
 
 
@@ -146,10 +151,10 @@ def columns(line: str) -> list[str]:
 
 def _stamp_and_name(line: str) -> tuple[float, str] | None:
     """Take a line of two columns apart; None where it has no finite stamp or no name."""
-    found = STAMP_FIRST.match(line)
+    found = _number_first(line)
     if found:
         stamp, rest = to_float(found.group(1)), found.group(2)
-        while (more := STAMP_FIRST.match(rest)) is not None:  # an index before the stamp, or seconds and nanoseconds
+        while (more := _number_first(rest)) is not None:  # an index before the stamp, or seconds and nanoseconds
             second = to_float(more.group(1))
             stamp, rest = (stamp + 1e-9 * second if _is_nanoseconds(stamp, second) else second), more.group(2)
     else:
@@ -160,6 +165,10 @@ def _stamp_and_name(line: str) -> tuple[float, str] | None:
     name = re.split(r"[\t;]", rest)[0].strip().strip(",").strip("\"'").strip()
     is_name = name and not WHOLE_NUMBER.fullmatch(name)
     return (stamp, name) if is_name and math.isfinite(stamp) else None
+
+
+def _number_first(text: str) -> re.Match | None:
+    return next((found for pattern in STAMP_FIRST if (found := pattern.match(text))), None)
 
 
 def _is_nanoseconds(seconds: float, rest: float) -> bool:

@@ -42,7 +42,6 @@ class Recorded:
     is_paired: bool = False  # row i of depth belongs to row i of colour, "" where there is none; else stamps decide
     depth_scale: float | None = None  # what this layout has where its calibration does not say it; None = it is measured
     truth: Truth | None = None
-    masks: Images | None = None  # by row of colour
     warnings: list[str] = field(default_factory=list)
 
 

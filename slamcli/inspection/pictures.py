@@ -1,6 +1,6 @@
 """One look at every image of a recording: exposure, blur, texture, depth readings, and whether the pictures follow one another."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -43,14 +43,15 @@ class Pictures:
     errors: list[str]  # of the images that cannot be used
 
 
-def look(dataset: Dataset, *, workers: int, progress: Progress) -> Pictures:
-    """Decode every image once."""
+def look(dataset: Dataset, *, workers: int, progress: Progress, frames: Sequence[int] | None = None) -> Pictures:
+    """Decode every image once, or those of some frames; rows are then of these alone."""
+    chosen = range(len(dataset)) if frames is None else frames
     rows: list[dict[str, Any]] = []
     errors: list[str] = []
     has_seen = np.zeros((dataset.camera.height, dataset.camera.width), dtype=bool)
     counts = np.zeros(DEPTH_VALUES, dtype=np.int64)
-    found = ordered_map(lambda i: _frame(dataset, i), range(len(dataset)), workers=workers)
-    for row, seen, frame_counts, frame_errors in progress(found, "inspect", total=len(dataset)):
+    found = ordered_map(lambda i: _frame(dataset, i), chosen, workers=workers)
+    for row, seen, frame_counts, frame_errors in progress(found, "inspect", total=len(chosen)):
         rows.append(row)
         errors += frame_errors
         if seen is not None:

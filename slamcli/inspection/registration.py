@@ -64,9 +64,9 @@ class _Edges:
     is_along_y: np.ndarray
 
 
-def measure(dataset: Dataset, *, workers: int) -> Registration:
-    """Measure shift and lag of a recording's depth."""
-    colours, edges = _collect(dataset, workers)
+def measure(dataset: Dataset, *, workers: int, blocks: int = BLOCKS) -> Registration:
+    """Measure shift and lag of a recording's depth in so many stretches of consecutive frames."""
+    colours, edges = _collect(dataset, workers, blocks)
     n_points = sum(len(e.xy) for e in edges)
     if n_points < LEAST_POINTS or len(colours.stamp) < 3:
         return Registration(None, None, n_points, 1.0, 1.0)
@@ -86,10 +86,10 @@ def measure(dataset: Dataset, *, workers: int) -> Registration:
     )
 
 
-def _collect(dataset: Dataset, workers: int) -> tuple[_Colours, list[_Edges]]:
+def _collect(dataset: Dataset, workers: int, blocks: int) -> tuple[_Colours, list[_Edges]]:
     """Read stretches of consecutive frames spread over the recording."""
     n = len(dataset)
-    starts = np.unique(np.linspace(0, max(n - BLOCK_FRAMES, 0), BLOCKS).astype(int))
+    starts = np.unique(np.linspace(0, max(n - BLOCK_FRAMES, 0), blocks).astype(int))
     wanted_depth = sorted({i for start in starts for i in range(start, min(start + BLOCK_FRAMES, n)) if dataset.depth_name[i]})
     wanted_colour = sorted({i for j in wanted_depth for i in range(max(j - AROUND, 0), min(j + AROUND + 1, n))})
     read = zip(wanted_colour, ordered_map(partial(_try, dataset.grey), wanted_colour, workers=workers), strict=True)

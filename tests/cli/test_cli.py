@@ -39,6 +39,7 @@ def fake(here: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         return made
 
     monkeypatch.setattr(datasets, "open_dataset", open_dataset)
+    monkeypatch.setattr("slamcli.inspection.quick_look", lambda dataset: [])  # a fake has no images
     for name in ("desk", "room"):
         (here / "recordings" / name).mkdir(parents=True)
     return here

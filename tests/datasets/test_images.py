@@ -115,3 +115,20 @@ def test_missing_file_and_folder_are_bad_frames(tmp_path: Path) -> None:
     for path in (tmp_path / "none.png", tmp_path):
         with pytest.raises(BadFrame, match="cannot be read"):
             grey(path)
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png"])
+@pytest.mark.parametrize("reduction", [1, 2, 3, 5, 8, 9])
+def test_large_pictures_are_averaged_without_a_shift(suffix: str, reduction: int) -> None:
+    """A ramp keeps its place: pixel u of the small picture lies at (u + 0.5) * reduction - 0.5 of the large one."""
+    size = (720, 360)
+    u, v = np.meshgrid(np.arange(size[0]), np.arange(size[1]))
+    ramp = (20 + 0.2 * u + 0.15 * v).astype(np.uint8)
+    data = png(np.repeat(ramp[..., None], 3, axis=2), suffix)
+    small = images.decode_grey(data, size, name="ramp", reduction=reduction)
+    assert small.shape == (size[1] // reduction, size[0] // reduction)
+    x, y = np.meshgrid(np.arange(small.shape[1]), np.arange(small.shape[0]))
+    expected = 20 + 0.2 * ((x + 0.5) * reduction - 0.5) + 0.15 * ((y + 0.5) * reduction - 0.5) - 0.5  # the ramp is rounded down
+    assert abs(float((small - expected).mean())) < 0.35 and np.abs(small - expected)[2:-2, 2:-2].max() < 3.0
+    rgb = images.decode_rgb(data, size, name="ramp", reduction=reduction)
+    assert rgb.shape == (*small.shape, 3) and np.abs(rgb[..., 1].astype(int) - small).max() <= 2

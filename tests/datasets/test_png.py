@@ -98,7 +98,9 @@ def test_mixed_filters_give_what_opencv_gives(seed: int, kinds: list[int], width
 def test_a_whole_file_is_grey_as_by_opencv(tmp_path: Path, kind: int) -> None:
     image = colour(48, 64, seed=kind)
     (tmp_path / "image.png").write_bytes(encoded(image, [kind] * 48))
-    assert np.array_equal(images.decode_grey(tmp_path / "image.png", (64, 48)), cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
+    assert np.array_equal(
+        images.decode_grey(images.read_bytes(tmp_path / "image.png"), (64, 48), name="image.png"), cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    )
 
 
 def test_chunks_that_change_no_pixel_are_passed_over() -> None:
@@ -174,4 +176,4 @@ def test_what_inflates_to_gigabytes_takes_no_more_memory_than_the_image(tmp_path
     assert asked == [4 * (1 + 3 * 5) + 1]
     (tmp_path / "bomb.png").write_bytes(bomb[: len(bomb) // 2])
     with pytest.raises(BadFrame, match=r"bomb\.png"):
-        images.decode_grey(tmp_path / "bomb.png", (5, 4))
+        images.decode_grey(images.read_bytes(tmp_path / "bomb.png"), (5, 4), name="bomb.png")

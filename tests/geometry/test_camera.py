@@ -97,3 +97,59 @@ def test_depth_read_under_another_calibration_is_that_of_its_readings():
     np.testing.assert_allclose(given.reread(there, camera), given.metres, rtol=1e-5)
     assert camera.reread(np.zeros(1, np.float32), given)[0] == 0.0  # no reading stays none
     assert given.reread(there, given) is there
+
+
+RATIONAL = Camera(1280, 720, 608.0, 607.0, 640.2, 365.1, 0.58, -2.49, 6e-4, -1e-4, 1.36, k4=0.46, k5=-2.33, k6=1.3)  # as of an Azure Kinect
+FISHEYE = Camera(848, 800, 286.0, 286.5, 421.0, 399.0, -0.008, 0.047, k3=-0.045, k4=0.008, lens="equidistant")  # as of a T265
+
+
+@pytest.mark.parametrize("camera", [RATIONAL, FISHEYE], ids=["rational", "equidistant"])
+def test_other_lenses_agree_with_opencv_and_are_undone(camera):
+    rng = np.random.default_rng(0)
+    x_c = np.concatenate([rng.uniform(-0.8, 0.8, (200, 2)), np.ones((200, 1))], axis=1)
+    if camera.lens == "equidistant":
+        coefficients = camera.coefficients[[0, 1, 4, 5]]
+        expected, _ = cv2.fisheye.projectPoints(x_c[:, None], np.zeros(3), np.zeros(3), camera.K, coefficients)
+        expected = expected[:, 0]
+    else:
+        expected = cv2.projectPoints(x_c, np.zeros(3), np.zeros(3), camera.K, camera.coefficients)[0][:, 0]
+    raw = camera.distort(camera.project(x_c))
+    np.testing.assert_allclose(raw, expected, atol=1e-6)
+    np.testing.assert_allclose(camera.undistort(raw), camera.project(x_c), atol=1e-5)
+
+
+@pytest.mark.parametrize("camera", [RATIONAL, FISHEYE], ids=["rational", "equidistant"])
+def test_rays_of_other_lenses_are_numbers_all_over_the_image(camera):
+    assert np.isfinite(camera.rays).all()
+    assert Camera.from_dict(camera.to_dict(), source="camera.json") == camera
+
+
+def test_a_camera_file_of_a_plain_lens_keeps_its_keys():
+    assert not {"k4", "k5", "k6", "lens"} & FREIBURG1.to_dict().keys()
+
+
+def test_a_scaled_camera_sees_the_same_rays_in_other_pixels():
+    half = FREIBURG1.scaled(320, 240)
+    xy = np.array([[100.0, 50.0], [619.0, 460.0]])
+    np.testing.assert_allclose(half.normalise((xy + 0.5) / 2 - 0.5), FREIBURG1.normalise(xy), atol=1e-12)
+    assert half.scaled(640, 480).to_dict() == pytest.approx(FREIBURG1.to_dict())
+    with pytest.raises(SlamError, match="another shape"):
+        FREIBURG1.scaled(640, 400)
+
+
+def test_a_turned_camera_sees_the_same_rays_turned():
+    camera = Camera(640, 480, 517.0, 516.0, 318.6, 255.3, 0.2, -0.9)
+    turned = camera.turned()
+    assert (turned.width, turned.height) == (480, 640)
+    x, y = 100.0, 50.0
+    np.testing.assert_allclose(
+        turned.normalise(np.array([479.0 - y, x])), [-camera.normalise(np.array([x, y]))[1], camera.normalise(np.array([x, y]))[0]]
+    )
+
+
+@pytest.mark.parametrize("kind", ["uint16", "float32"])
+def test_readings_become_metres_and_none_where_there_is_none(kind):
+    camera = Camera(8, 6, 10.0, 11.0, 3.5, 2.5, depth_scale=1000.0 if kind == "uint16" else 1.0)
+    raw = np.array([0, 1500, 65535], np.uint16) if kind == "uint16" else np.array([0.0, 1.5, np.inf], np.float32)
+    found = camera.to_metres(raw)
+    assert found.dtype == np.float32 and np.isnan(found[[0, 2]]).all() and found[1] == pytest.approx(1.5)

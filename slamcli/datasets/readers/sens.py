@@ -48,6 +48,7 @@ def read(path: Path) -> Recorded:
     file_map = _Map(path)
     colour_size, depth_size = (sizes[0], sizes[1]), (sizes[2], sizes[3])
     stamps = np.array([frame[1] for frame in frames], dtype=np.float64)
+    depth_stamps = np.array([frame[2] for frame in frames], dtype=np.float64)
     has_stamps = len(np.unique(stamps)) == len(stamps)
     k_colour, T_bc, k_depth, T_bd = matrices
     calibration = of_two(_intrinsics(k_colour, colour_size), _intrinsics(k_depth, depth_size), T_bc, T_bd, f"{path}: its head")
@@ -55,7 +56,7 @@ def read(path: Path) -> Recorded:
         reader="sens",
         root=path,
         colour=Stream(SensColour(file_map, [f[3] for f in frames], colour_kind, colour_size), stamps if has_stamps else None, str(path)),
-        depth=Stream(SensDepth(file_map, [f[4] for f in frames], depth_kind, depth_size), None, str(path)),
+        depth=Stream(SensDepth(file_map, [f[4] for f in frames], depth_kind, depth_size), depth_stamps if has_stamps else None, str(path)),
         calibration=calibration,
         is_paired=True,
         depth_scale=float(scale) if scale >= 1.0 else None,

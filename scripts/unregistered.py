@@ -1,0 +1,99 @@
+"""Depth that was never registered to colour: re-render a recording's depth as another camera sees it, and run that.
+
+    python scripts/unregistered.py path/to/rgbd_dataset_freiburg1_xyz
+
+Each row is a run of the same colour images: with depth as it is, and with depth of a camera of another focal length that sits aside and
+turned, whose calibration is given in camera.toml, or is kept back. Errors are against the recording's truth, without and with scale.
+"""
+
+import argparse
+import tempfile
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+import slamcli
+from slamcli.console import table
+from slamcli.datasets import Dataset, open_dataset
+from slamcli.geometry.camera import Camera
+from slamcli.geometry.depth_registration import Registration
+
+TURN_DEG = 0.5
+CASES = {"585 px, 25 mm": (585.0, 0.025), "385 px, 15 mm": (385.0, 0.015)}
+
+
+def main() -> None:
+    """Run every case."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("recording")
+    parser.add_argument("--frames", type=int, default=10**9, help="from the beginning")
+    parser.add_argument("--kept-back", action="store_true", help="also without the depth camera's calibration")
+    arguments = parser.parse_args()
+    dataset = open_dataset(arguments.recording)
+    n = min(arguments.frames, len(dataset))
+    rows = [["depth", "APE [m]", "with scale", "scale", "frames"]]
+    with tempfile.TemporaryDirectory() as folder:
+        place = Path(folder)
+        rows.append(["registered", *figures(write(dataset, place / "registered", n, None, is_told=True), place / "runs/registered")])
+        for name, (focal, aside) in CASES.items():
+            given = rig(dataset.camera, focal, aside)
+            for is_told in (True, False) if arguments.kept_back else (True,):
+                label = f"{name}, {'given' if is_told else 'kept back'}"
+                folder_name = label.replace(" ", "_").replace(",", "")
+                rows.append([label, *figures(write(dataset, place / folder_name, n, given, is_told=is_told), place / "runs" / folder_name)])
+                print(table(rows[-1:]), flush=True)
+    print(table(rows))
+
+
+def rig(colour: Camera, focal: float, aside: float) -> Registration:
+    """Put a depth camera beside the colour camera."""
+    depth_camera = Camera(640, 480, focal, focal, 320.0, 240.0, depth_scale=colour.depth_scale)
+    T_cd = np.eye(4)
+    T_cd[:3, :3] = cv2.Rodrigues(np.radians(TURN_DEG) * np.array([0.5, 0.7, 0.5]))[0]
+    T_cd[0, 3] = aside
+    return Registration(depth_camera, colour, T_cd)
+
+
+def write(dataset: Dataset, out: Path, n: int, given: Registration | None, *, is_told: bool) -> Path:
+    """Write a folder that links to the colour images, with depth as the other camera sees it."""
+    (out / "depth").mkdir(parents=True)
+    (out / "rgb").symlink_to(dataset.root.resolve() / "rgb")
+    lists: dict[str, list[str]] = {"rgb": [], "depth": []}
+    seen_by = Registration(dataset.camera, given.depth_camera, np.linalg.inv(given.T_cd)) if given else None
+    for i in range(n):
+        lists["rgb"].append(f"{dataset.stamp[i]:.6f} {dataset.colour_name[i]}")
+        depth = dataset.depth(i)
+        if depth is None:
+            continue
+        moved = seen_by.apply(depth) if seen_by else depth
+        raw = np.rint(np.nan_to_num(moved * dataset.camera.depth_scale)).clip(0, 65534).astype(np.uint16)
+        cv2.imwrite(str(out / "depth" / f"{i}.png"), raw)
+        lists["depth"].append(f"{dataset.depth_stamp[i]:.6f} depth/{i}.png")
+    for name, lines in lists.items():
+        (out / f"{name}.txt").write_text("\n".join(lines) + "\n")
+    lines = [f"{key} = {value!r}" for key, value in dataset.camera.to_dict().items()]
+    if given is not None and is_told:
+        camera = given.depth_camera
+        lines += [
+            "[depth]",
+            f"fx = {camera.fx}",
+            f"fy = {camera.fy}",
+            f"cx = {camera.cx}",
+            f"cy = {camera.cy}",
+            f"T_cd = {given.T_cd.tolist()}",
+        ]
+    (out / "camera.toml").write_text("\n".join(lines) + "\n")
+    (out / "groundtruth.txt").symlink_to(dataset.root.resolve() / "groundtruth.txt")
+    return out
+
+
+def figures(recording: Path, out: Path) -> list[str]:
+    """Run a recording up to loop and measure it."""
+    run = slamcli.run(str(recording), path=out, until="loop")
+    ape = run.ape()
+    return [f"{np.sqrt(np.mean(ape.error**2)):.4f}", f"{ape.rmse_scaled:.4f}", f"{ape.scale:.4f}", str(ape.n_poses)]
+
+
+if __name__ == "__main__":
+    main()

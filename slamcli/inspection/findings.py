@@ -1,0 +1,181 @@
+"""Judgements of a recording in plain words: what was found, how grave it is, what to do about it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from slamcli.datasets import Dataset
+from slamcli.datasets.depth_unit import DepthUnit
+from slamcli.inspection import pictures, timing
+from slamcli.inspection.pictures import Pictures
+from slamcli.inspection.registration import Registration
+from slamcli.inspection.timing import Timing
+
+ERROR, WARNING, NOTE = "error", "warning", "note"
+
+# Thresholds lie between what sound recordings show and what the fault shows; the sound ones measured are TUM fr1_xyz and fr3_teddy.
+BLURRED = 0.60  # blur effect; sound recordings reach 0.58 in their fastest moments, a Gaussian of 2 px starts at 0.60
+BURNT_OUT = 0.35  # share of saturated pixels; sound ones reach 0.24 (windows)
+TOO_BRIGHT, TOO_DARK = 215.0, 25.0  # mean grey levels
+FEW_CORNERS = 25.0  # FAST corners per 640 x 480 px
+FEW_FRAMES = 0.02  # share of frames that may be so without a word
+MANY_FRAMES = 0.5  # share from which a run makes no sense
+HOLES = 0.5  # share of the pixels without depth in a typical frame; sound ones have 0.17 to 0.31
+NEVER_SEEN = 0.35  # share of the pixels without depth in all frames; sound ones have 0.11 to 0.15
+EMPTY = 0.98  # share of holes from which a depth image counts as empty
+UNMATCHED = 0.15  # share of colour frames without depth; sound ones have 0.01 to 0.04
+SHIFT = 4.0 / 640  # of the picture's width; sound ones are within 1 px of 640
+EXPECTED_LAG = (-0.02, 0.035)  # [s]; the stamps of the first Kinect's depth are about 0.02 s late
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing found, in plain words, and what to do about it."""
+
+    level: str
+    check: str
+    message: str
+    advice: str = ""
+
+
+def about_lists(dataset: Dataset, times: Timing) -> list[Finding]:
+    """Judge what opening the recording put right, gaps, and frames without a partner."""
+    findings = [Finding(WARNING, "lists", message, "the program puts this right; mend the list to be rid of the warning")
+                for message in dataset.warnings if "depth_scale" not in message and "hold no reading" not in message]  # fmt: skip
+    for what, gaps in (("colour", times.gaps), ("depth", times.depth_gaps)):
+        if gaps:
+            start, length = max(gaps, key=lambda gap: gap[1])
+            count = f"{len(gaps)} gaps" if len(gaps) > 1 else "a gap"
+            findings.append(
+                Finding(
+                    WARNING,
+                    "gaps",
+                    f"{count} in {what}, the longest of {length:.2f} s, {start:.2f} s after the start",
+                    "tracking may be lost there; record to a faster disk, or cut the recording in two",
+                )
+            )
+    n, n_with_depth = len(dataset), times.n_with_depth
+    if n - n_with_depth > UNMATCHED * n:
+        findings.append(
+            Finding(
+                WARNING,
+                "unmatched",
+                f"{n - n_with_depth} of {n} colour frames have no depth image within {timing.MAX_DIFFERENCE:g} s",
+                "compare the rates and the clocks of both lists",
+            )
+        )
+    if n < 30:
+        findings.append(Finding(NOTE, "length", f"only {n} frames", "a map of this little will be small"))
+    return findings
+
+
+def about_order(dataset: Dataset, times: Timing, seen: Pictures) -> list[Finding]:
+    """Judge whether images follow one another as their stamps say."""
+    findings = []
+    if times.misnamed:
+        first = times.misnamed[0]
+        findings.append(
+            Finding(
+                WARNING,
+                "order",
+                f"{len(times.misnamed)} frames have other stamps than their files' names say, the first is {dataset.colour_name[first]}",
+                "the stamps in the list are swapped or edited; restore the list",
+            )
+        )
+    has_depth = np.array([bool(path) for path in dataset.depth_name])
+    rows = np.flatnonzero(has_depth)
+    for what, paths, found in (
+        ("colour", dataset.colour_name, pictures.misplaced(seen.thumbnail, dataset.stamp)),
+        ("depth", dataset.depth_name, rows[pictures.misplaced(seen.depth_thumbnail[rows], dataset.depth_stamp[rows])]),
+    ):
+        if len(found):
+            findings.append(
+                Finding(
+                    WARNING,
+                    "order",
+                    f"{len(found)} {what} images do not follow from those before and after, the first is {paths[found[0]]}",
+                    "their stamps may be swapped, or images of another recording got in",
+                )
+            )
+    return findings
+
+
+def about_files(dataset: Dataset, seen: Pictures) -> list[Finding]:
+    """Judge images that cannot be used."""
+    if not seen.errors:
+        return []
+    n_images = 2 * len(seen.mean_grey)
+    level = ERROR if len(seen.errors) > MANY_FRAMES * n_images else WARNING
+    more = f" and {len(seen.errors) - 1} more" if len(seen.errors) > 1 else ""
+    return [Finding(level, "files", f"{seen.errors[0]}{more}", "such frames are skipped; copy or unpack the recording again")]
+
+
+def about_colour(seen: Pictures) -> list[Finding]:
+    """Judge blur, exposure and texture of the pictures."""
+    findings = []
+    burnt = (seen.saturated > BURNT_OUT) | (seen.mean_grey > TOO_BRIGHT)
+    dark = seen.mean_grey < TOO_DARK
+    blurred = (seen.blur > BLURRED) & ~burnt & ~dark
+    bare = (seen.corners < FEW_CORNERS) & ~burnt & ~dark & ~blurred
+    for check, is_so, message, advice in (
+        ("blur", blurred, "blurred", "move slower, or shorten the exposure"),
+        ("exposure", burnt, "over-exposed", "lower exposure or gain; what is burnt out has no features"),
+        ("exposure", dark, "nearly black", "raise exposure or gain, or switch the light on"),
+        (
+            "texture",
+            bare,
+            f"almost without texture (fewer than {FEW_CORNERS:g} corners)",
+            "tracking may be lost there; keep furniture in view",
+        ),
+    ):
+        n, known = int(is_so.sum()), int(np.isfinite(seen.mean_grey).sum())
+        limit = 0.1 if check == "texture" else FEW_FRAMES
+        if n > limit * known:
+            level = ERROR if n > MANY_FRAMES * known else WARNING
+            findings.append(Finding(level, check, f"{n} of {known} colour images are {message}", advice))
+    return findings
+
+
+def about_depth(dataset: Dataset, times: Timing, seen: Pictures) -> list[Finding]:
+    """Judge holes and empty images of depth."""
+    holes = seen.holes[np.isfinite(seen.holes)]
+    is_empty = holes > EMPTY
+    if not len(holes) or is_empty.all():
+        return [Finding(ERROR, "empty depth", "no depth image holds a reading", "check how depth was recorded; 16-bit PNG, 0 = none")]
+    findings = []
+    if is_empty.sum() > FEW_FRAMES * len(holes):
+        level = ERROR if is_empty.mean() > MANY_FRAMES else WARNING
+        message = f"{int(is_empty.sum())} of {len(holes)} depth images are empty"
+        findings.append(Finding(level, "empty depth", message, "something covered the camera, or the depth stream broke off"))
+    typical = float(np.median(holes[~is_empty]))
+    if typical > HOLES:
+        message = f"a typical depth image has no reading in {typical:.0%} of its pixels"
+        findings.append(Finding(WARNING, "holes", message, "too near, too far, glass, sunlight, or an image cut in half"))
+    elif seen.never_seen > NEVER_SEEN:
+        message = f"{seen.never_seen:.0%} of the picture have no depth in any frame"
+        findings.append(Finding(WARNING, "holes", message, "depth may be registered to another camera or cut off"))
+    return findings
+
+
+def about_unit(dataset: Dataset, unit: DepthUnit) -> list[Finding]:
+    """Judge the depth scale."""
+    if unit.likely_scale is None:
+        return []
+    message = f"the depth scale {dataset.camera.depth_scale:g} is doubtful: {unit.reason}"
+    return [Finding(ERROR, "depth scale", message, f"try: -s camera.depth_scale={unit.likely_scale:g}")]
+
+
+def about_registration(dataset: Dataset, fit: Registration, times: Timing) -> list[Finding]:
+    """Judge whether depth lies on colour, in place and in time."""
+    findings = []
+    if fit.shift is not None and max(map(abs, fit.shift)) > max(SHIFT * dataset.camera.width, 2.0):
+        message = f"depth does not lie on colour: its edges fit when moved by ({fit.shift[0]:+.0f}, {fit.shift[1]:+.0f}) px"
+        findings.append(Finding(WARNING, "registration", message, "register depth to the colour camera, with that camera's calibration"))
+    if fit.lag is not None and not EXPECTED_LAG[0] <= fit.lag <= EXPECTED_LAG[1]:
+        late = "late" if fit.lag > 0 else "early"
+        message = f"depth stamps are {abs(fit.lag):.3f} s {late}: the edges of depth and colour meet only then"
+        findings.append(Finding(WARNING, "time offset", message, f"add {-fit.lag:+.3f} s to the stamps in the depth list"))
+    elif fit.lag is None and times.depth_names_offset is not None and abs(times.depth_names_offset) > 0.02:
+        message = f"the depth stamps differ from their files' names by {times.depth_names_offset:+.3f} s"
+        findings.append(Finding(WARNING, "time offset", message, "the clock of depth was moved; restore the list unless that was meant"))
+    return findings
