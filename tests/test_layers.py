@@ -33,6 +33,7 @@ FLOORS = (
     ("visualization",),
     ("report", "inspection"),
     ("api",),
+    ("batch",),
     ("cli",),
     ("__main__",),
 )
