@@ -99,7 +99,7 @@ def work_off(client: "Client", jobs: Sequence[Job], *, retries: int = RETRIES, p
             futures.append(last)
         futures.append(client.submit(worker.finish, job, last, **options))
         ends[futures[-1].key] = job
-    for future in progress(as_completed(futures), "batch [stages]", len(futures)):
+    for future in progress(as_completed(futures, loop=client.loop), "batch [stages]", len(futures)):
         if future.status in ("cancelled", "lost"):
             raise SlamError("the connection to the scheduler is lost; start it again and give the same command: what is done is kept")
         if future.key in ends:
@@ -125,4 +125,5 @@ def _quiet() -> None:
         import distributed  # noqa: F401
     except ImportError as error:
         raise SlamError("a batch needs Dask: pip install 'slamcli[cluster]'") from error
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)
+    for name in [name for name in logging.root.manager.loggerDict if name.partition(".")[0] == "distributed"]:
+        logging.getLogger(name).setLevel(logging.CRITICAL)

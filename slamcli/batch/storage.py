@@ -104,8 +104,8 @@ class StoredRun:
         self.url, self.path = url, Path(path)
         self._system, self._root = connect(url)
 
-    def pull(self, root: str) -> None:
-        """Bring the copy up to what is stored; `root` is where the recording lies on this machine.
+    def pull(self, root: str, *, until: str = NAMES[-1]) -> None:
+        """Bring the copy up to what is stored, as far as a stage; `root` is where the recording lies on this machine.
 
         What is here already stays, and so does what cannot be read whole: the pipeline then makes it anew.
         """
@@ -118,13 +118,15 @@ class StoredRun:
             files.write_text(self.path / "run.json", _with_root(info, root))
         run = RunDir(self.path)
         with run.lock():
-            for stage in NAMES:
+            for stage in NAMES[: NAMES.index(until) + 1]:
                 self._pull_stage(run, stage)
 
     def _pull_stage(self, run: RunDir, stage: str) -> None:
+        if (self.path / stage / "stage.json").exists():
+            return
         text = self._text(f"{stage}/stage.json")
         record = _record(text) if text is not None else None
-        if record is None or (self.path / stage / "stage.json").exists():
+        if record is None:
             return
         with run.writing(stage) as folder, suppress(FileNotFoundError):
             for name in record["outputs"]:

@@ -67,7 +67,7 @@ def finish(job: Job, last: Done) -> dict[str, Any]:
         desk = Desk(job)
         try:
             if not last.failure:
-                desk.open()
+                desk.open(job.order.until)
             return {**row, **figures.of_run(desk.directory)}
         except SlamError as error:
             return {**row, "state": "failed", "reason": str(error)}
@@ -84,20 +84,20 @@ class Desk:
         self.copies = _scratch() / job.name
         self.directory = RunDir(self.copies / "run" if self.is_stored else Path(job.run))
 
-    def open(self) -> str:
-        """Bring recording and run to this machine; returns what `slamcli run` would be told."""
+    def open(self, until: str) -> str:
+        """Bring recording and run, as far as a stage, to this machine; returns what `slamcli run` would be told."""
         job, recording = self.job, self.job.recording
         if storage.is_url(recording):
             recording = str(storage.fetch_recording(recording, self.copies))
         if self.is_stored:
-            self._stored().pull(recording)
+            self._stored().pull(recording, until=until)
         elif not (Path(job.order.out) / job.order.marker).is_file():
             raise RuntimeError(f"{job.order.out} is not the folder that the client means: workers and client must share it")
         return recording
 
     def run_stage(self, stage: str) -> Done:
         """Bring the run up to date as far as `stage`, in general that stage alone."""
-        target, order = self.open(), self.job.order
+        target, order = self.open(stage), self.job.order
         resolve = partial(_resolve, given=order.config, settings=order.settings)
         directory, dataset, config = api.create_run(target, resolve=resolve, path=self.directory.path, data=order.data)
         # Another process may still be at it for a client that has died since: what it makes is then found up to date.
