@@ -88,7 +88,7 @@ def work_off(client: "Client", jobs: Sequence[Job], *, retries: int = RETRIES, p
     """
     from distributed import as_completed
 
-    ends: dict[str, Job] = {}
+    ends: dict[Any, Job] = {}  # by the key of the future that closes it
     futures: list[Future] = []
     here = worker.identity()
     for place, job in enumerate(jobs):

@@ -78,7 +78,7 @@ class Processes:
 def bucket() -> Iterator[str]:
     """The URL of an empty bucket of an S3 server in this process; workers inherit where it is."""
     pytest.importorskip("s3fs", reason="the S3 tests need s3fs")
-    moto = pytest.importorskip("moto.server", reason="the S3 tests need moto[server]")
+    moto = pytest.importorskip("moto.server", reason="the S3 tests need moto and flask-cors")
     server = moto.ThreadedMotoServer(port=0)
     server.start()
     host, port = server.get_host_and_port()
