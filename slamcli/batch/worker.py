@@ -4,6 +4,7 @@ A recording that cannot be worked off, and why, is a result like any other. What
 not answer, is an exception, which Dask answers by trying again.
 """
 
+import logging
 import shutil
 import tempfile
 import threading
@@ -98,6 +99,7 @@ class Desk:
     def run_stage(self, stage: str) -> Done:
         """Bring the run up to date as far as `stage`, in general that stage alone."""
         target, order = self.open(stage), self.job.order
+        logging.getLogger("slamcli").setLevel(logging.DEBUG)  # a run's log.txt has everything, here as from the command line
         resolve = partial(_resolve, given=order.config, settings=order.settings)
         directory, dataset, config = api.create_run(target, resolve=resolve, path=self.directory.path, data=order.data)
         # Another process may still be at it for a client that has died since: what it makes is then found up to date.
