@@ -234,13 +234,13 @@ def create_run(
     from slamcli.datasets import open_dataset
 
     def opened(config: Config) -> "Dataset":
-        return open_dataset(target, data=data, camera=dict(config.camera) or None, progress=progress)
+        return open_dataset(target, data=data, camera=dict(config.camera) or None, options=config.recording, progress=progress)
 
     first = resolve(RunDir(Path(path)).config() if path is not None else None)
     dataset = opened(first)
     place = Path(path) if path is not None else default_path(dataset.name)
     config = resolve(RunDir(place).config())
-    if config.camera != first.camera:  # only now is it known that an earlier command gave this run another camera
+    if (config.camera, config.recording) != (first.camera, first.recording):  # an earlier command gave this run others
         dataset = opened(config)
     directory = RunDir.create(place, dataset=dataset.name, root=str(dataset.root.resolve()), digest=dataset.digest())
     return directory, dataset, config

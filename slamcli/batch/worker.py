@@ -19,10 +19,9 @@ from slamcli.batch.jobs import Job
 from slamcli.config import toml
 from slamcli.config.options import Config
 from slamcli.errors import SlamError
-from slamcli.runs import pipeline, source_code, staleness
+from slamcli.runs import pipeline, source_code
 from slamcli.runs.pipeline import Pipeline
 from slamcli.runs.run_directory import RunDir
-from slamcli.stages import NAMES
 
 # OpenCV's threads, BLAS and the cost meter belong to the process, so that a worker with several threads runs one stage at a time.
 _ONE_AT_A_TIME = threading.Lock()
@@ -38,9 +37,8 @@ class Done:
 
 
 def identity() -> dict[str, Any]:
-    """Say which program this process runs: version, digest of the sources that make results, versions of the libraries."""
-    code = {file: digest for name in NAMES for file, digest in source_code.of_stage(name).items()}
-    return {"slamcli": __version__, "code": staleness.digest(code), "environment": pipeline.environment()}
+    """Say which program this process runs: version, digest of the sources, versions of the libraries."""
+    return {"slamcli": __version__, "code": source_code.of_package(), "environment": pipeline.environment()}
 
 
 def run_stage(job: Job, stage: str, before: Done | None, client: dict[str, Any]) -> Done:

@@ -242,7 +242,8 @@ class Pipeline:
         tools: Tools,
         summary: Mapping[str, Any],
     ) -> dict[str, Any]:
-        declared, code = staleness.declared(stage, self.config), source_code.of_stage(stage.name)
+        reader = self.dataset().reader if "dataset" in stage.needs else ""
+        declared, code = staleness.declared(stage, self.config), source_code.of_stage(stage.name, reader)
         frames = summary.get("frames")
         return {
             "format": FORMAT,
@@ -251,6 +252,7 @@ class Pipeline:
             "config": declared,
             "inputs": dict(inputs),
             "code": dict(code),
+            "reader": reader,
             "outputs": outputs,
             "digest": staleness.digest({name: entry["sha256"] for name, entry in outputs.items()}),
             "environment": environment(),

@@ -183,7 +183,9 @@ class RunDir:
         for stage in STAGES:
             damage = self.damage(stage.name, verify=verify)
             record = None if damage else self.record(stage.name)
-            states[stage.name] = staleness.assess(stage, config, record, damage, states, input_digest, source_code.of_stage(stage.name))
+            states[stage.name] = staleness.assess(
+                stage, config, record, damage, states, input_digest, source_code.of_stage(stage.name, (record or {}).get("reader", ""))
+            )
         return states
 
     def record(self, stage: str) -> dict[str, Any] | None:
@@ -282,6 +284,6 @@ def _is_record(record: Mapping[str, Any]) -> bool:
     if not all(isinstance(record.get(name), kind) for name, kind in RECORD_KEYS.items()) or "slamcli" not in record["environment"]:
         return False
     entries = record["outputs"].values()
-    return isinstance(record.get("code", {}), dict) and all(
-        isinstance(e, dict) and isinstance(e.get("bytes"), int) and isinstance(e.get("sha256"), str) for e in entries
-    )
+    if not isinstance(record.get("code", {}), dict) or not isinstance(record.get("reader", ""), str):
+        return False
+    return all(isinstance(e, dict) and isinstance(e.get("bytes"), int) and isinstance(e.get("sha256"), str) for e in entries)

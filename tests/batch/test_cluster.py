@@ -260,7 +260,7 @@ def test_a_scheduler_without_workers_and_none_at_all_are_said(tmp_path: Path, sl
 
 
 def test_a_worker_with_another_program_is_refused(dask: Processes, monkeypatch: pytest.MonkeyPatch, slamcli: Slamcli, here: Path) -> None:
-    monkeypatch.setattr(source_code, "of_stage", lambda name: {"slam/tracker.py": "0" * 12})
+    monkeypatch.setattr(source_code, "of_package", lambda: "0" * 12)
     refused = slamcli("batch", "demo", "--out", "runs", "--cluster", dask.address)
     assert refused.exit_code == 1
     assert "of other sources than the client's" in refused.stderr
