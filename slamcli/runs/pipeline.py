@@ -1,5 +1,6 @@
 """Run stages: give each what it declared and nothing else, record what it did, and run exactly those that are not up to date."""
 
+import functools
 import importlib
 import logging
 import math
@@ -255,7 +256,7 @@ class Pipeline:
             "reader": reader,
             "outputs": outputs,
             "digest": staleness.digest({name: entry["sha256"] for name, entry in outputs.items()}),
-            "environment": environment(),
+            "environment": dict(environment()),
             "seconds": round(meter.seconds, 3),
             "cpu_seconds": round(meter.cpu_seconds, 3),
             "compile_seconds": round(meter.compile_seconds, 3),
@@ -285,7 +286,8 @@ def _plain(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def environment() -> dict[str, str]:
+@functools.cache
+def environment() -> Mapping[str, str]:
     """Name the versions a result may depend on; they are recorded and shown, and make nothing stale."""
     found = {"slamcli": __version__, "python": platform.python_version()}
     for name, package in PACKAGES.items():
