@@ -24,6 +24,7 @@ COLUMNS = {
     "coverage": ("with a pose", ".1%"),
     "closures": ("loops closed", "d"),
     "ape_m": ("APE [m]", ".4f"),
+    "map": ("map for a robot", ""),
     "seconds": ("time [s]", ".1f"),
     "cpu_seconds": ("CPU [s]", ".1f"),
     "peak_mib": ("peak memory [MiB]", ".0f"),
@@ -64,6 +65,7 @@ def _judged(run: RunDir) -> dict[str, Any]:
     return {
         "coverage": round(float(content.has_pose.mean()), 4),
         "ape_m": round(ape.to_dict()["rmse"], 5) if ape else None,
+        "map": "" if content.verdict is None else "usable" if content.verdict.is_usable else "not usable",
         "doubt": " ".join(grave),
     }
 
