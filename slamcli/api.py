@@ -11,6 +11,7 @@ import logging
 import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -63,7 +64,9 @@ def run(
 
     Raises SlamError for whatever the caller can mend, such as a recording that is not there or an option that is not known.
     """
-    opened, dataset, resolved = _create(str(target), settings, config, path, data, progress)
+    settings = settings if isinstance(settings, Mapping) else tuple(settings)
+    resolve = partial(toml.resolve, name_or_file=config, settings=settings)
+    opened, dataset, resolved = create_run(str(target), resolve=resolve, path=path, data=data, progress=progress)
     if look is not None and not Pipeline(opened, resolved, dataset=dataset).states()[NAMES[0]].is_fresh:
         look(dataset)
     _bring_up_to_date(opened, resolved, dataset, start=start, until=until, force=force, progress=progress, tell=tell)
@@ -129,7 +132,7 @@ class Run:
     def run_stage(self, stage: str, *, settings: Settings = (), progress: Progress = silent, tell: Tell = log.info) -> "Run":
         """Run one stage alone, even when it is up to date, from whatever its predecessors left."""
         resolved = toml.resolve(self.config(), None, settings)
-        with _writing(self.directory, resolved):
+        with writing(self.directory, resolved):
             Pipeline(self.directory, resolved, progress=progress, tell=tell).run_alone(stage)
         return self
 
@@ -223,40 +226,47 @@ class Run:
         return target
 
 
-def _create(
-    target: str, settings: Settings, config: str | None, path: str | os.PathLike[str] | None, data: str | None, progress: Progress
+def create_run(
+    target: str,
+    *,
+    resolve: Callable[[Config | None], Config],
+    path: str | os.PathLike[str] | None = None,
+    data: str | None = None,
+    progress: Progress = silent,
 ) -> "tuple[RunDir, Dataset, Config]":
-    """Open the recording and make or open its run."""
+    """Open the recording and make its run, or open the run that is there; no stage is run and no configuration written.
+
+    resolve : gives the configuration under which to run, from the run's own; None where there is no run yet
+    """
     from slamcli.datasets import open_dataset
 
-    def opened(resolved: Config) -> "Dataset":
-        return open_dataset(target, data=data, camera=dict(resolved.camera) or None, options=resolved.recording, progress=progress)
+    def opened(config: Config) -> "Dataset":
+        return open_dataset(target, data=data, camera=dict(config.camera) or None, options=config.recording, progress=progress)
 
-    settings = settings if isinstance(settings, Mapping) else tuple(settings)
     if path is not None:
         RunDir(Path(path)).restore()
-    first = toml.resolve(RunDir(Path(path)).config() if path is not None else None, config, settings)
+    first = resolve(RunDir(Path(path)).config() if path is not None else None)
     dataset = opened(first)
     place = Path(path) if path is not None else default_path(dataset.name)
     RunDir(place).restore()
-    resolved = toml.resolve(RunDir(place).config(), config, settings)
-    if (resolved.camera, resolved.recording) != (first.camera, first.recording):  # as an earlier command said; it is only known now
-        dataset = opened(resolved)
+    config = resolve(RunDir(place).config())
+    if (config.camera, config.recording) != (first.camera, first.recording):  # an earlier command gave this run others
+        dataset = opened(config)
     directory = RunDir.create(place, dataset=dataset.name, root=str(dataset.root.resolve()), digest=dataset.digest())
-    return directory, dataset, resolved
+    return directory, dataset, config
 
 
 def _bring_up_to_date(
     directory: RunDir, config: Config, dataset: "Dataset | None", *, progress: Progress, tell: Tell, **which: Any
 ) -> None:
-    with _writing(directory, config):
+    with writing(directory, config):
         directory.mark_latest()
         Pipeline(directory, config, dataset=dataset, progress=progress, tell=tell).bring_up_to_date(**which)
 
 
 @contextmanager
-def _writing(directory: RunDir, config: Config) -> Iterator[None]:
-    """Lock the run, log to its file, and make `config` its configuration."""
-    with directory.lock(), log_file(directory.path / "log.txt"):
+def writing(directory: RunDir, config: Config, *, wait: bool = False) -> Iterator[None]:
+    """Lock the run, log to its file, and make `config` its configuration; `wait` for another process that holds it."""
+    with directory.lock(wait=wait), log_file(directory.path / "log.txt"):
         directory.write_config(config)
         yield

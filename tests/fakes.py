@@ -20,7 +20,7 @@ IGNORED = {"extract": ("cell",)}  # options that change no byte of the fake's ou
 class FakeDataset:
     """A recording known by its digest alone."""
 
-    name = "fake"
+    name = reader = "fake"
     warnings = ("rgb.txt: 2 repeated stamps",)
 
     def __init__(self, root: Path, content: str = "frames") -> None:

@@ -34,6 +34,7 @@ FLOORS = (
     ("visualization",),
     ("report", "inspection"),
     ("api",),
+    ("batch",),
     ("cli",),
     ("__main__",),
 )

@@ -13,6 +13,7 @@ from slamcli.errors import SlamError
 LACKING = ("Cannot allocate", "failed to map", "start new thread", "load shared object")  # in the errors of libraries short of memory
 TOPICS = (
     "run",
+    "batch",
     "evaluate",
     "export",
     "maps",

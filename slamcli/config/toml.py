@@ -2,6 +2,7 @@
 
 import dataclasses
 import difflib
+import functools
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -154,6 +155,12 @@ def _camera_value(key: str, value: Any, source: str) -> float | str:
     return _typed(expected, value, _origin(f"camera.{key}", value, source))
 
 
+@functools.cache
+def _hints(section: type) -> dict[str, Any]:
+    """Evaluate the types of a section's options; each option of each configuration asks for them."""
+    return get_type_hints(section)
+
+
 def _value(section: type, section_name: str, key: str, value: Any, source: str) -> Any:
     """Check one value against its declaration and give it in the declared type."""
     name = f"{section_name}.{key}" if section_name else key
@@ -161,7 +168,7 @@ def _value(section: type, section_name: str, key: str, value: Any, source: str) 
     if spec is None or _is_section(spec):
         raise _unknown(name, source)
     origin, meta = _origin(name, value, source), spec.metadata
-    value = _typed(get_type_hints(section)[key], value, origin)
+    value = _typed(_hints(section)[key], value, origin)
     for bound, limit in meta["bounds"].items():
         sign, holds = COMPARISONS[bound]
         if not holds(value, limit):

@@ -1,6 +1,7 @@
 """Compile all kernels of a run before their first use on a machine, side by side, into the cache that later runs load them from."""
 
 import contextlib
+import fcntl
 import hashlib
 import importlib
 import logging
@@ -47,18 +48,30 @@ def ensure(*, progress: Progress = silent, tell: Tell = log.info) -> None:
     done = cache.folder() / f"compiled-{_digest()}"
     if done.exists():
         return
-    start, n = time.perf_counter(), 0
-    tell(COMPILING)
-    try:
-        for _ in progress(compile_all(_cores()), "compiling [kernels]"):
-            n += 1
-    except IncompleteError:  # not marked as done: the next run tries again
-        log.warning("%s: not every kernel could be kept there, so they are compiled anew each time; is the disk full?", done.parent)
-        return
-    log.info("compiled %d kernels in %.1f s", n, time.perf_counter() - start)
-    with contextlib.suppress(OSError):  # a full disk: the next run looks again, and finds what could be kept
-        done.parent.mkdir(parents=True, exist_ok=True)
-        done.touch()
+    with _alone(done.parent):
+        if done.exists():
+            return
+        start, n = time.perf_counter(), 0
+        tell(COMPILING)
+        try:
+            for _ in progress(compile_all(_cores()), "compiling [kernels]"):
+                n += 1
+        except IncompleteError:  # not marked as done: the next run tries again
+            log.warning("%s: not every kernel could be kept there, so they are compiled anew each time; is the disk full?", done.parent)
+            return
+        log.info("compiled %d kernels in %.1f s", n, time.perf_counter() - start)
+        with contextlib.suppress(OSError):  # a full disk: the next run looks again, and finds what could be kept
+            done.touch()
+
+
+@contextlib.contextmanager
+def _alone(folder: Path) -> Iterator[None]:
+    """Let one program at a time compile into a folder: the others would only do the same work beside it."""
+    with contextlib.ExitStack() as stack:
+        with contextlib.suppress(OSError):  # a file system without locks, or a full one: then side by side
+            folder.mkdir(parents=True, exist_ok=True)
+            fcntl.flock(stack.enter_context(open(folder / ".lock", "a")), fcntl.LOCK_EX)
+        yield
 
 
 def compile_all(processes: int) -> Iterator[str]:

@@ -29,6 +29,7 @@ RECORD_KEYS: dict[str, Any] = {
     "warnings": list,
     "n_warnings": int,
     "code": dict,
+    "reader": str,
 }
 
 

@@ -1,5 +1,6 @@
 """Run stages: give each what it declared and nothing else, record what it did, and run exactly those that are not up to date."""
 
+import functools
 import importlib
 import logging
 import math
@@ -243,7 +244,8 @@ class Pipeline:
         tools: Tools,
         summary: Mapping[str, Any],
     ) -> dict[str, Any]:
-        declared, code = staleness.declared(stage, self.config), source_code.of_stage(stage.name)
+        reader = self.dataset().reader if "dataset" in stage.needs else ""
+        declared, code = staleness.declared(stage, self.config), source_code.of_stage(stage.name, reader)
         frames = summary.get("frames")
         return {
             "format": FORMAT,
@@ -252,10 +254,11 @@ class Pipeline:
             "config": declared,
             "inputs": dict(inputs),
             "code": dict(code),
+            "reader": reader,
             "outputs": outputs,
             "digest": files.digest({name: entry["sha256"] for name, entry in outputs.items()}),
             "recording": {name: self.run.info()[name] for name in ("dataset", "root")},
-            "environment": environment(),
+            "environment": dict(environment()),
             "seconds": round(meter.seconds, 3),
             "cpu_seconds": round(meter.cpu_seconds, 3),
             "compile_seconds": round(meter.compile_seconds, 3),
@@ -278,7 +281,8 @@ def _plain(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def environment() -> dict[str, str]:
+@functools.cache
+def environment() -> Mapping[str, str]:
     """Name the versions a result may depend on; they are recorded and shown, and make nothing stale."""
     found = {"slamcli": __version__, "python": platform.python_version()}
     for name, package in PACKAGES.items():

@@ -236,7 +236,8 @@ class RunDir:
         for stage in STAGES:
             found = self.damage(stage.name, verify=verify)
             record = None if found else self.record(stage.name)
-            states[stage.name] = staleness.assess(stage, config, record, found, states, input_digest, source_code.of_stage(stage.name))
+            sources = source_code.of_stage(stage.name, (record or {}).get("reader", ""))
+            states[stage.name] = staleness.assess(stage, config, record, found, states, input_digest, sources)
         return states
 
     def record(self, stage: str) -> dict[str, Any] | None:
@@ -265,11 +266,11 @@ class RunDir:
     # writing
 
     @contextmanager
-    def lock(self) -> Iterator[None]:
-        """Hold the run for writing; SlamError when another process does. Whatever a killed process left is cleared first."""
+    def lock(self, *, wait: bool = False) -> Iterator[None]:
+        """Hold the run for writing; when another process does, wait or raise SlamError. What a killed process left is cleared first."""
         with open(self.path / ".lock", "a+") as file:
             try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                fcntl.flock(file, fcntl.LOCK_EX if wait else fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
                 file.seek(0)
                 raise SlamError(f"{self.path}: in use by another slamcli (process {file.read(20).strip() or '?'}); wait for it") from None

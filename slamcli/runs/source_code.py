@@ -16,11 +16,13 @@ PACKAGE = Path(__file__).parents[1]
 DIGITS = 12  # hexadecimal, of a file's digest: chance equality of two states of a file is out of the question
 SHOWN = 3  # changed files that a reason names
 READING = "datasets/__init__.py"  # through it the pipeline opens the recording for a stage that needs one
+READERS = "datasets/readers/"  # loaded by name, one for each layout
 
 # Reached by imports, yet without influence on what a stage computes from its inputs.
 APART = frozenset(
     {
         "__init__.py",  # the API's names
+        "stages/contract.py",  # says in Protocols what a stage is given
         "stages/__init__.py",  # the table: what of it matters to a stage, its needs and its sections, is in the key itself
         "config/options.py",  # declares the options, whose values are in the key
         "console.py",  # what the user sees
@@ -37,10 +39,24 @@ IMPORT = re.compile(r"^ *(?:from +(slamcli[\w.]*) +import +(\([^)]*\)|.*)|import
 
 
 @functools.cache
-def of_stage(name: str) -> Mapping[str, str]:
-    """Return the digest of every file that a stage can reach, by its name within the package. They are read once a process."""
-    start = [f"stages/{name}.py"] + ([READING] if "dataset" in stage_named(name).needs else [])
+def of_stage(name: str, reader: str = "") -> Mapping[str, str]:
+    """Return the digest of every file that a stage can reach, by its name within the package. They are read once a process.
+
+    reader : the layout of the recording, whose reader counts for a stage that needs the recording; "" = none
+    """
+    start = [f"stages/{name}.py"]
+    if "dataset" in stage_named(name).needs:
+        start += [READING] + [file for file in [f"{READERS}{reader}.py"] if reader and _is_file(file)]
     return {file: _digest(file) for file in sorted(reachable(start))}
+
+
+@functools.cache
+def of_package() -> str:
+    """Digest all sources of the package, as they are when it is first asked."""
+    digest = hashlib.sha256()
+    for path in sorted(PACKAGE.rglob("*.py")):
+        digest.update(f"{path.relative_to(PACKAGE).as_posix()} {hashlib.sha256(path.read_bytes()).hexdigest()}\n".encode())
+    return digest.hexdigest()[:DIGITS]
 
 
 def changes(recorded: Mapping[str, str], now: Mapping[str, str]) -> str:

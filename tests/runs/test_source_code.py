@@ -68,13 +68,14 @@ def test_the_text_is_read_as_the_parser_reads_it(file: str) -> None:
     assert source_code.imported(file) == parsed_imports(ast.parse((PACKAGE / file).read_text()))
 
 
-def test_whatever_a_stage_loads_can_be_reached() -> None:
+def test_whatever_a_stage_loads_can_be_reached(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(source_code, "APART", frozenset())
     code = "import importlib, sys; importlib.import_module(sys.argv[1]); print(*(m for m in sys.modules if m.split('.')[0] == 'slamcli'))"
     for name in NAMES:
         command = [sys.executable, "-c", code, f"slamcli.stages.{name}"]
         modules = subprocess.run(command, capture_output=True, text=True, check=True, cwd=PACKAGE.parent, timeout=120).stdout.split()
         loaded = {file for module in modules for file in source_code._files_of(module)}
-        assert loaded - source_code.APART <= set(source_code.of_stage(name)), name
+        assert loaded <= source_code.reachable([f"stages/{name}.py"]), name
 
 
 def test_every_file_that_is_set_apart_exists_and_the_options_hold_no_code() -> None:
@@ -98,12 +99,15 @@ def test_every_file_that_is_set_apart_exists_and_the_options_hold_no_code() -> N
         ("runs/pipeline.py", set(), set(NAMES)),
         ("datasets/simulated/room.py", set(), set(NAMES)),
         ("config/options.py", set(), set(NAMES)),
+        ("datasets/recording.py", {"extract", "densify", "octree", "grid2d"}, {"match"}),
+        ("datasets/readers/tum.py", {"extract", "densify", "octree", "grid2d"}, {"match", "track", "optimize", "loop"}),
+        ("datasets/readers/replica.py", set(), set(NAMES)),
     ],
 )
 def test_a_change_concerns_the_stages_that_can_reach_the_file(edit, file: str, concerned: set[str], unconcerned: set[str]) -> None:
-    before = {name: source_code.of_stage(name) for name in NAMES}
+    before = {name: source_code.of_stage(name, "tum") for name in NAMES}
     edit(file)
-    now = {name: source_code.of_stage(name) for name in NAMES}
+    now = {name: source_code.of_stage(name, "tum") for name in NAMES}
     told = {name: source_code.changes(before[name], now[name]) for name in NAMES}
     stale = {name for name in NAMES if told[name]}
     assert stale >= concerned
@@ -137,5 +141,15 @@ def test_a_record_without_sources_is_stale_and_a_hostile_one_is_damage(room_run:
     record = files.read_sealed(path)
     files.write_sealed(path, {**record, "code": {}})
     assert run.states()["match"].reason == "code: its sources were not recorded"
-    files.write_sealed(path, {**record, "code": ["stages/match.py"]})
-    assert run.states()["match"].state == "damaged"
+    for hostile in ({"code": ["stages/match.py"]}, {"reader": 3}):
+        files.write_sealed(path, {**record, **hostile})
+        assert run.states()["match"].state == "damaged"
+
+
+def test_the_reader_of_the_recording_counts(edit, room_run: Path, tmp_path: Path) -> None:
+    run = RunDir(shutil.copytree(room_run, tmp_path / "run"))
+    assert run.record("extract")["reader"] == "tum" and run.record("match")["reader"] == ""
+    edit("datasets/readers/replica.py")
+    assert all(state.is_fresh for state in run.states().values())
+    edit("datasets/readers/tum.py")
+    assert run.states()["extract"].reason == "code: datasets/readers/tum.py changed"

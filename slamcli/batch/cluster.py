@@ -1,0 +1,129 @@
+"""Hand a batch to a Dask cluster: a scheduler that runs already, or one of our own on this machine."""
+
+import logging
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+from slamcli.batch import worker
+from slamcli.batch.jobs import Job
+from slamcli.console import Progress, Tell, silent
+from slamcli.errors import SlamError
+from slamcli.jit import compilation
+from slamcli.runs.pipeline import environment
+
+if TYPE_CHECKING:
+    from distributed import Client, Future
+
+log = logging.getLogger(__name__)
+
+MEMORY = 2 << 30  # bytes that a worker should have: twice the peak of a run of 10 000 frames
+CONNECT = 20.0  # [s] to wait for a scheduler
+RETRIES = 2  # of a task that ends in something other than a recording's own fault
+
+
+def local_size(workers: int | None) -> tuple[int, int, int]:
+    """Choose workers, threads a stage and bytes of memory a worker for this machine; within its cores and its memory."""
+    from distributed.system import MEMORY_LIMIT
+
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    n = workers or max(1, min(cores, int(MEMORY_LIMIT) // MEMORY))
+    return n, max(1, cores // n), int(MEMORY_LIMIT) // n
+
+
+@contextmanager
+def local(workers: int, memory: int, *, progress: Progress = silent, tell: Tell = log.info) -> "Iterator[Client]":
+    """Start a cluster of worker processes on this machine; it ends with the block."""
+    _quiet()
+    from distributed import Client, LocalCluster
+
+    compilation.ensure(progress=progress, tell=tell)  # once, and not by every worker at the same time
+    options = {"n_workers": workers, "threads_per_worker": 1, "memory_limit": memory, "dashboard_address": None}
+    with LocalCluster(processes=True, host="127.0.0.1", **options) as cluster, Client(cluster) as client:
+        yield client
+
+
+@contextmanager
+def remote(address: str) -> "Iterator[Client]":
+    """Connect to a scheduler; SlamError when none answers, when it has no workers, or when one of them runs another program."""
+    _quiet()
+    from distributed import Client
+
+    try:
+        client = Client(address, timeout=CONNECT, set_as_default=False)
+    except (OSError, ValueError) as error:
+        raise SlamError(f"{address}: no Dask scheduler answers ({_first_line(error)}); start one with: dask scheduler") from error
+    with client:
+        check(client, address)
+        yield client
+
+
+def check(client: "Client", address: str) -> None:
+    """Compare every worker's program with the client's: other sources are an error, other versions of libraries a warning."""
+    try:
+        found = client.run(worker.identity)
+    except Exception as error:  # whatever a worker without slamcli answers, it says so
+        raise SlamError(f"{address}: a worker cannot run slamcli ({_first_line(error)}); install the client's version there") from error
+    if not found:
+        raise SlamError(f"{address}: the scheduler has no workers; start some with: dask worker {address} --nthreads 1")
+    here = worker.identity()
+    for where, there in found.items():
+        if there["code"] != here["code"]:
+            raise SlamError(
+                f"{address}: worker {where} runs slamcli {there['slamcli']} of other sources than the client's {here['slamcli']}; "
+                "install the same version on every worker"
+            )
+        for name, version in environment().items():
+            if there["environment"].get(name) != version:
+                log.warning(
+                    "worker %s has %s %s, the client %s: the last digits may differ", where, name, there["environment"].get(name), version
+                )
+
+
+def work_off(client: "Client", jobs: Sequence[Job], *, retries: int = RETRIES, progress: Progress = silent) -> Iterator[dict[str, Any]]:
+    """Run all jobs; yield a row for each as it ends, whether it succeeded or not.
+
+    Earlier recordings come first, so that few are under way at a time. Raises SlamError when the scheduler is lost.
+    """
+    from distributed import as_completed
+
+    ends: dict[Any, Job] = {}  # by the key of the future that closes it
+    futures: list[Future] = []
+    here = worker.identity()
+    for place, job in enumerate(jobs):
+        options = {"priority": -place, "retries": retries, "pure": False}
+        last: Future | None = None
+        for stage in job.stages:
+            last = client.submit(worker.run_stage, job, stage, last, here, **options)
+            futures.append(last)
+        futures.append(client.submit(worker.finish, job, last, **options))
+        ends[futures[-1].key] = job
+    for future in progress(as_completed(futures, loop=client.loop), "batch [stages]", len(futures)):
+        if future.status in ("cancelled", "lost"):
+            raise SlamError("the connection to the scheduler is lost; start it again and give the same command: what is done is kept")
+        if future.key in ends:
+            yield _row(ends[future.key], future)
+
+
+def _row(job: Job, end: "Future") -> dict[str, Any]:
+    """Take over the row that a worker made; of a task that could not be ended, the exception's first line is the reason."""
+    if end.status == "finished":
+        return end.result()
+    reason = _first_line(end.exception())
+    return {"recording": job.recording, "run": job.run, "state": "failed", "reason": reason}
+
+
+def _first_line(error: BaseException | None) -> str:
+    text = str(error).strip().splitlines()
+    return f"{type(error).__name__}: {text[0]}" if text else type(error).__name__
+
+
+def _quiet() -> None:
+    """Keep Dask's own log to what ends something; SlamError where Dask is not installed."""
+    try:
+        import distributed  # noqa: F401
+    except ImportError as error:
+        raise SlamError("a batch needs Dask: pip install 'slamcli[cluster]'") from error
+    for name in [name for name in logging.root.manager.loggerDict if name.partition(".")[0] == "distributed"]:
+        logging.getLogger(name).setLevel(logging.CRITICAL)

@@ -1,0 +1,118 @@
+"""What a batch is to do: its recordings, where their runs go, and under which settings."""
+
+import os
+import re
+import uuid
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from slamcli.batch import storage
+from slamcli.config.options import Config
+from slamcli.errors import SlamError
+from slamcli.stages import NAMES
+
+LIST_SUFFIX = ".txt"
+
+
+@dataclass(frozen=True)
+class Order:
+    """What holds for every recording of a batch."""
+
+    out: str  # folder of the runs: an absolute path that every worker sees, or a URL
+    settings: tuple[str, ...] = ()  # as after -s
+    config: Config | None = None  # to start from instead of a run's own
+    data: str | None = None  # folder of recordings to look in first
+    until: str = NAMES[-1]  # the last stage
+    threads: int = 1  # of a stage
+    marker: str = ""  # name of a file in `out` by which a worker knows that it sees the same folder; "" for a URL
+
+
+@dataclass(frozen=True)
+class Job:
+    """One recording of a batch."""
+
+    name: str  # of its run, below the folder of the runs; unique within the batch
+    recording: str  # what `slamcli run` takes, or a URL
+    order: Order
+
+    @property
+    def run(self) -> str:
+        """Where the run goes: an absolute path or a URL."""
+        return f"{self.order.out}/{self.name}"
+
+    @property
+    def stages(self) -> tuple[str, ...]:
+        """The stages to run, in order."""
+        return NAMES[: NAMES.index(self.order.until) + 1]
+
+
+def jobs(recordings: Sequence[str], order: Order) -> list[Job]:
+    """Give each recording a run of its own, named after it; SlamError for none, and for one that is named twice."""
+    found = [_absolute(recording) for recording in _listed(recordings)]
+    if not found:
+        raise SlamError("no recording to work off; name some, or a list of them: a .txt file with one a line")
+    twice = [recording for recording, n in Counter(found).items() if n > 1]
+    if twice:
+        raise SlamError(f"{twice[0]}: named twice; each recording has one run")
+    return [Job(name, recording, order) for name, recording in zip(names(found), found, strict=True)]
+
+
+def _listed(recordings: Iterable[str]) -> list[str]:
+    """Replace each list by what stands in it: a recording a line, # begins a comment."""
+    found: list[str] = []
+    for given in recordings:
+        if given.endswith(LIST_SUFFIX) and (storage.is_url(given) or Path(given).is_file()):
+            lines = (line.partition("#")[0].strip() for line in storage.read_text(given).splitlines())
+            found += [line for line in lines if line]
+        else:
+            found.append(given)
+    return found
+
+
+def _absolute(recording: str) -> str:
+    """Make a path independent of the current folder, which is another one where the workers are."""
+    if storage.is_url(recording):
+        return recording.rstrip("/")
+    path = Path(recording).expanduser()
+    return str(path.resolve()) if path.exists() else recording
+
+
+def names(recordings: Sequence[str]) -> list[str]:
+    """Name runs after their recordings: by the last part of the path, and where that is not unique by as many parts as it takes."""
+    parts = [[re.sub(r"[^A-Za-z0-9._-]", "_", part).lstrip(".") for part in re.split(r"[/\\]+", text) if part] for text in recordings]
+    found = ["" for _ in parts]
+    for length in range(1, max(map(len, parts)) + 1):
+        tried = ["-".join(p for p in part[-length:] if p) or "recording" for part in parts]
+        counts = Counter(tried)
+        found = [name or (new if counts[new] == 1 and new not in found else "") for name, new in zip(found, tried, strict=True)]
+    return [name or f"recording{k}" for k, name in enumerate(found)]
+
+
+def absolute_out(out: str) -> str:
+    """Make the folder of the runs an absolute path; a URL stays one."""
+    return out.rstrip("/") if storage.is_url(out) else os.path.abspath(os.path.expanduser(out))
+
+
+def with_threads(order: Order, threads: int) -> Order:
+    """Give each stage so many threads; its result does not depend on them."""
+    return replace(order, threads=threads)
+
+
+@contextmanager
+def prepared(order: Order) -> Iterator[Order]:
+    """Make the folder of the runs, with a file in it by which workers know the folder again; the file goes with the block."""
+    if storage.is_url(order.out):
+        storage.connect(order.out)
+        yield order
+        return
+    marker = f".batch-{uuid.uuid4().hex[:12]}"
+    Path(order.out).mkdir(parents=True, exist_ok=True)
+    path = Path(order.out) / marker
+    path.touch()
+    try:
+        yield replace(order, marker=marker)
+    finally:
+        path.unlink(missing_ok=True)

@@ -1,0 +1,92 @@
+"""What a batch is to do, and its table."""
+
+import csv
+import io
+from pathlib import Path
+
+import pytest
+
+from slamcli.batch import figures, jobs, storage
+from slamcli.batch.jobs import Order
+from slamcli.errors import SlamError
+from slamcli.stages import NAMES
+
+
+@pytest.mark.parametrize(
+    "recordings, names",
+    [
+        (["/data/a", "/data/b"], ["a", "b"]),
+        (["/monday/scan", "/tuesday/scan", "/data/b"], ["monday-scan", "tuesday-scan", "b"]),
+        (["s3://bucket/walk.mcap", "tum/fr1_room", "demo"], ["walk.mcap", "fr1_room", "demo"]),
+        (["/x/scan", "/y/x/scan", "s3://x/scan"], None),
+        (["/data/..hidden ü", "/"], None),
+    ],
+)
+def test_runs_are_named_after_recordings_and_never_alike(recordings: list[str], names: list[str] | None) -> None:
+    found = jobs.names(recordings)
+    assert names is None or found == names
+    assert len(set(found)) == len(recordings)
+    assert all(name and "/" not in name and not name.startswith(".") for name in found)
+
+
+def test_a_list_has_a_recording_a_line_and_comments(here: Path) -> None:
+    (here / "room").mkdir()
+    (here / "list.txt").write_text("# this week\nroom   # the first\n\ntum/fr1_xyz\ns3://bucket/walk/\n")
+    found = jobs.jobs(["list.txt", "demo"], Order(out="/runs"))
+    assert [job.recording for job in found] == [str(here / "room"), "tum/fr1_xyz", "s3://bucket/walk", "demo"]
+    assert found[0].run == "/runs/room"
+    assert found[0].stages == NAMES
+
+
+@pytest.mark.parametrize(
+    "given, message", [(["demo", "demo"], "named twice"), (["empty.txt"], "no recording"), (["./a", "a"], "named twice")]
+)
+def test_what_is_no_batch_is_said(here: Path, given: list[str], message: str) -> None:
+    (here / "empty.txt").write_text("# nothing\n")
+    (here / "a").mkdir()
+    with pytest.raises(SlamError, match=message):
+        jobs.jobs(given, Order(out="/runs"))
+
+
+def test_stages_end_where_the_order_says() -> None:
+    (job,) = jobs.jobs(["demo"], Order(out="s3://bucket/runs", until="track"))
+    assert job.stages == ("extract", "match", "track")
+    assert job.run == "s3://bucket/runs/demo"
+
+
+def test_the_marker_is_there_for_the_time_of_the_batch(here: Path) -> None:
+    with jobs.prepared(Order(out=str(here / "runs"))) as order:
+        assert (here / "runs" / order.marker).is_file()
+    assert list((here / "runs").iterdir()) == []
+
+
+def test_a_url_without_its_package_names_the_package() -> None:
+    with pytest.raises(SlamError, match=r"nowhere://a/b: "):
+        storage.connect("nowhere://a/b")
+
+
+ROWS = [
+    {"recording": "a", "run": "/r/a", "state": "done", "reason": "", "frames": 40, "coverage": 0.975, "ape_m": 0.00412, "seconds": 8.0,
+     "cpu_seconds": 12.0, "peak_mib": 300.5, "output_mb": 4.2, "warnings": 1, "doubt": "Lost, \"often\"", "closures": 1},
+    {"recording": "<script>", "run": "/r/b", "state": "failed", "reason": "rgb.txt: not\nthere"},
+]  # fmt: skip
+
+
+def test_the_csv_reads_back(here: Path) -> None:
+    read = list(csv.DictReader(io.StringIO(figures.as_csv(ROWS))))
+    assert [row["state"] for row in read] == ["done", "failed"]
+    assert read[0]["doubt"] == 'Lost, "often"' and float(read[0]["ape_m"]) == 0.00412
+    assert read[1]["reason"] == "rgb.txt: not\nthere" and read[1]["coverage"] == ""
+
+
+def test_the_page_escapes_what_comes_from_outside_counts_and_puts_failures_first() -> None:
+    page = figures.as_page(ROWS)
+    assert "<script>" not in page and "&lt;script&gt;" in page
+    assert "2 recordings: 1 done, 1 failed, 1 to doubt" in page
+    assert page.index("&lt;script&gt;") < page.index("Lost, ")
+    assert "97.5%" in page and "0.0041" in page
+
+
+def test_lines_tell_what_became_of_a_recording() -> None:
+    assert figures.as_line(ROWS[0]) == "a: done, 97.5% of 40 frames, APE 0.0041 m, 12.0 s of CPU time, to doubt"
+    assert figures.as_line(ROWS[1]).startswith("<script>: failed: rgb.txt: not")
