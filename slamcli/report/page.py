@@ -39,13 +39,14 @@ def render(content: Content, pictures: list[Picture], inspected: Sequence[tuple[
         "versions": _pairs(_versions(content)),
         "made": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
         "data": json.dumps(_data(content), separators=(",", ":"), allow_nan=False).replace("<", "\\u003c"),
-        "style": _resource("page.css"),
-        "script": _resource("page.js"),
+        "style": resource("page.css"),
+        "script": resource("page.js"),
     }
-    return re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found.group(1)], _resource("page.html"))
+    return re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found.group(1)], resource("page.html"))
 
 
-def _resource(name: str) -> str:
+def resource(name: str) -> str:
+    """Read a file of this package."""
     return resources.files(__package__).joinpath(name).read_text(encoding="utf-8")
 
 
@@ -95,9 +96,9 @@ def _cards(content: Content) -> str:
         ("time per frame", f"{1000 * seconds / n:.0f} ms"),
         ("peak memory", f"{max(record.get('peak_rss_mb', 0.0) for record in records):.0f} MiB"),
     ]
-    is_doubtful = content.verdict is not None and not content.verdict.is_usable
+    is_amber = content.verdict is not None and not content.verdict.is_usable
     return "".join(
-        f'<div class="card{" amber" if name == "free floor" and is_doubtful else ""}"><b>{html.escape(_thousands(value))}</b><span>{name}</span></div>'
+        f'<div class="card{" amber" if name == "free floor" and is_amber else ""}"><b>{html.escape(_thousands(value))}</b><span>{name}</span></div>'
         for name, value in cards
         if value is not None
     )
