@@ -10,7 +10,19 @@ from slamcli import __version__
 from slamcli.cli.common import verbose_option
 from slamcli.errors import SlamError
 
-TOPICS = ("run", "evaluate", "export", "maps", "grid", "visualize", "localize", "simulate", "features", "vocab")  # modules of this package
+TOPICS = (
+    "run",
+    "evaluate",
+    "compare",
+    "export",
+    "maps",
+    "grid",
+    "visualize",
+    "localize",
+    "simulate",
+    "features",
+    "vocab",
+)  # modules of this package
 
 
 class Group(click.Group):

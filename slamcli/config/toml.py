@@ -297,6 +297,11 @@ def _first_line(section: type) -> str:
     return (section.__doc__ or "").strip().splitlines()[0]
 
 
+def as_text(value: Any) -> str:
+    """Write a value as TOML, or a dash where there is none."""
+    return "-" if value is None else _toml(value)
+
+
 def _toml(value: Any) -> str:
     if isinstance(value, bool):
         return "true" if value else "false"
