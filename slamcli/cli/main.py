@@ -12,6 +12,7 @@ from slamcli.errors import SlamError
 
 TOPICS = (
     "run",
+    "runs",
     "evaluate",
     "compare",
     "export",
