@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from slamcli.cli.common import config_option, json_option, run_option, set_option
+from slamcli.cli.common import complete_target, config_option, json_option, run_option, set_option
 from slamcli.stages import NAMES, STAGES, Stage
 
 if TYPE_CHECKING:
@@ -20,7 +20,7 @@ STAGE = click.Choice(NAMES)
 
 
 @click.command("run")
-@click.argument("target", required=False)
+@click.argument("target", required=False, shell_complete=complete_target)
 @click.option("-r", "--run", metavar="DIR", help="Where the run goes. [default: $SLAMCLI_RUN, else runs/<recording>]")
 @click.option("--data", metavar="DIR", help="Where recordings lie. [default: $SLAMCLI_DATA, else ./data]")
 @config_option

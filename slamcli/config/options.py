@@ -36,15 +36,11 @@ class RecordingConfig:
     """Which part of the recording is used, and how what it does not say is filled in; no stage declares it: it changes the recording."""
 
     start: float = option(0.0, "time after the first frame at which to begin [s]", ge=0)
-    end: float = option(0.0, "time after the first frame at which to stop; 0 = at the last one [s]", ge=0)
+    end: float = option(0.0, "time after the first frame at which to stop; 0 = never [s]", ge=0)
     every: int = option(1, "use every n-th frame", ge=1)
-    fps: float = option(0.0, "frame rate of a recording whose stamps are missing or no clock; 0 = 30 [Hz]", ge=0, le=1000)
-    known_camera: str = option(
-        "", 'name of a known camera whose nominal intrinsics are used, such as "kinect1" or "d435"; "" = the recording\'s own'
-    )
-    full_size: bool = option(
-        False, "use pictures of more than a megapixel as they are, instead of reduced to about 640 px: 3 to 9 times the time"
-    )
+    fps: float = option(0.0, "frame rate of a recording without stamps; 0 = 30 [Hz]", ge=0, le=1000)
+    known_camera: str = option("", 'known camera whose nominal intrinsics are used, such as "d435"; "" = the recording\'s own')
+    full_size: bool = option(False, "use pictures of more than a megapixel whole, not reduced to about 640 px")
 
 
 @dataclass(frozen=True)

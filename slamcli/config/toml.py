@@ -134,7 +134,17 @@ def _camera_keys() -> list[str]:
     return [spec.name for spec in dataclasses.fields(Camera)]
 
 
-def _known_keys() -> list[str]:
+def choices(name: str) -> list[str]:
+    """List the values that an option may have, where these can be listed; its full name is given."""
+    section, _, key = name.partition(".")
+    spec = next((spec for spec in dataclasses.fields(_sections().get(section, Config)) if spec.name == key), None)
+    if spec is None or "choices" not in spec.metadata:
+        return []
+    return ["true", "false"] if isinstance(spec.default, bool) else [str(value) for value in spec.metadata["choices"]]
+
+
+def known_keys() -> list[str]:
+    """List every option by its full name."""
     keys = [spec.name for spec in dataclasses.fields(Config) if spec.name != "camera" and not _is_section(spec)]
     keys += [f"camera.{key}" for key in _camera_keys()]
     return keys + [f"{name}.{spec.name}" for name, section in _sections().items() for spec in dataclasses.fields(section)]
@@ -142,7 +152,7 @@ def _known_keys() -> list[str]:
 
 def _unknown(key: str, source: str) -> SlamError:
     """Build the error for a key nobody declared, with those that may be meant: the same option of a section, else the nearest name."""
-    known = _known_keys()
+    known = known_keys()
     near = [name for name in known if name.rpartition(".")[2] == key.rpartition(".")[2]]
     if "." in key:
         near = difflib.get_close_matches(key, near, n=1, cutoff=0.0)
@@ -204,7 +214,7 @@ def _typed_tuple(expected: tuple, value: Any, origin: str) -> tuple:
 def changed(config: Config) -> list[str]:
     """List the full names of the options that differ from the defaults, and camera where anything of it is overridden."""
     defaults = Config()
-    names = [name for name in _known_keys() if not name.startswith("camera.") and _get(config, name) != _get(defaults, name)]
+    names = [name for name in known_keys() if not name.startswith("camera.") and _get(config, name) != _get(defaults, name)]
     return names + (["camera"] if config.camera else [])
 
 
@@ -220,7 +230,7 @@ def find_options(words: Sequence[str]) -> list[str]:
     """
     found: list[str] = []
     for word in words:
-        if word in _sections() or word in _known_keys() or word == "camera":
+        if word in _sections() or word in known_keys() or word == "camera":
             found.append(word)
             continue
         hits = [name for name, help_text in _help().items() if word.lower() in name.lower() or word.lower() in help_text.lower()]
@@ -246,7 +256,7 @@ def dump(config: Config, *, explain: bool = False, only: Sequence[str] = (), wit
     only : sections ("track") and options ("track.min_inliers") to write; all of them when empty
     """
     for name in only:
-        if name not in _known_keys() and name not in _sections() and name != "camera":
+        if name not in known_keys() and name not in _sections() and name != "camera":
             raise _unknown(name, "config")
     told = Told(explain=explain, with_defaults=with_defaults)
     blocks = [_block("", Config, config, told, only)]

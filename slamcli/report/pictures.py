@@ -74,7 +74,7 @@ def _octree(run: RunDir, title: str, path: np.ndarray) -> Picture:
     image = render.draw_octree(tree, view=VIEW, path=path, with_scale=True)
     return Picture(
         title,
-        f"occupied cells of {float(tree.resolution):g} m, coloured by height, from {low:.1f} m (blue) to {high:.1f} m (red); {sizes}",
+        f"occupied cells of {float(tree.resolution):g} m, coloured by height, from {round(low, 1) + 0.0:.1f} m (blue) to {high:.1f} m (red); {sizes}",
         _jpeg(image),
     )
 

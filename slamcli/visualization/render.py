@@ -161,7 +161,7 @@ def _finish(image: np.ndarray, z_buffer: np.ndarray, eye: _Eye, path: np.ndarray
 def _height_range(z: np.ndarray) -> tuple[float, float]:
     """Return the heights [m] that the ends of the colours stand for; single cells far off do not count."""
     low, high = np.quantile(z, [0.005, 0.995])
-    return float(low), float(high)
+    return round(float(low), 6) + 0.0, float(high)  # + 0.0: no -0.0
 
 
 def _height_colours(z: np.ndarray, between: tuple[float, float] | None = None) -> np.ndarray:
