@@ -129,9 +129,11 @@ class Run:
         _bring_up_to_date(self.directory, resolved, None, start=start, until=until, force=force, progress=progress, tell=tell)
         return self
 
-    def run_stage(self, stage: str, *, settings: Settings = (), progress: Progress = silent, tell: Tell = log.info) -> "Run":
+    def run_stage(
+        self, stage: str, *, settings: Settings = (), config: str | None = None, progress: Progress = silent, tell: Tell = log.info
+    ) -> "Run":
         """Run one stage alone, even when it is up to date, from whatever its predecessors left."""
-        resolved = toml.resolve(self.config(), None, settings)
+        resolved = toml.resolve(self.config(), config, settings)
         with writing(self.directory, resolved):
             Pipeline(self.directory, resolved, progress=progress, tell=tell).run_alone(stage)
         return self

@@ -8,17 +8,71 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import click
+from click.shell_completion import CompletionItem
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 SELECTION = ("start", "end", "every", "fps", "known_camera")  # options of the section `recording` that have a flag
 
-run_option = click.option("-r", "--run", metavar="DIR", help="The run directory. [default: $SLAMCLI_RUN, else runs/latest]")
+
+def complete_setting(context: click.Context, parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
+    """Complete the name of an option for -s, and its value where there are only a few."""
+    from slamcli.config import toml
+
+    name, equals, value = incomplete.partition("=")
+    if equals:
+        return [CompletionItem(f"{name}={choice}") for choice in toml.choices(name) if choice.startswith(value)]
+    return [CompletionItem(f"{key}=") for key in toml.known_keys() if key.startswith(incomplete)]
+
+
+def complete_config(context: click.Context, parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
+    """Complete the name of a shipped configuration, or a file."""
+    from slamcli.config import toml
+
+    named = [CompletionItem(name) for name in toml.shipped() if name.startswith(incomplete)]
+    return named or [CompletionItem(incomplete, type="file")]
+
+
+def complete_target(context: click.Context, parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
+    """Complete a recording: demo, one in the data folder, or any folder."""
+    data = Path(context.params.get("data") or os.environ.get("SLAMCLI_DATA") or "data")
+    names = [
+        "demo",
+        *(path.relative_to(data).as_posix() for pattern in ("*", "*/*") for path in sorted(data.glob(pattern)) if path.is_dir()),
+    ]
+    return [CompletionItem(name) for name in names if name.startswith(incomplete)] or [CompletionItem(incomplete, type="dir")]
+
+
+def complete_run(context: click.Context, parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
+    """Complete a run below runs/, or any folder."""
+    found = [path.parent.as_posix() for pattern in ("*/run.json", "*/*/run.json") for path in sorted(Path("runs").glob(pattern))]
+    return [CompletionItem(name) for name in found if name.startswith(incomplete)] or [CompletionItem(incomplete, type="dir")]
+
+
+run_option = click.option(
+    "-r",
+    "--run",
+    metavar="DIR",
+    shell_complete=complete_run,
+    help="The run directory, or its name under runs/. [default: $SLAMCLI_RUN, else runs/latest]",
+)
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON for programs.")
 set_option = click.option(
-    "-s", "--set", "assignments", multiple=True, metavar="KEY=VALUE", help="Set an option, such as -s track.min_inliers=20."
+    "-s",
+    "--set",
+    "assignments",
+    multiple=True,
+    metavar="KEY=VALUE",
+    shell_complete=complete_setting,
+    help="Set an option, such as -s track.min_inliers=20.",
 )
-config_option = click.option("--config", "config_name", metavar="NAME|FILE", help="Start from fast, accurate, default or a TOML file.")
+config_option = click.option(
+    "--config",
+    "config_name",
+    metavar="NAME|FILE",
+    shell_complete=complete_config,
+    help="Start from fast, accurate, default or a TOML file.",
+)
 
 
 class Mount(click.ParamType):

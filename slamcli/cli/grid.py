@@ -155,23 +155,23 @@ def _ends(
     from slamcli.errors import SlamError
     from slamcli.navigation import planner
 
-    ends = {"start": start, "goal": goal}
-    named = {name: end for name, end in ends.items() if isinstance(end, str)}
-    if named:
-        if path is None:
-            raise SlamError("--map: a map file does not tell where a camera was; give --start and --goal as x,y")
-        known = path[np.isfinite(path).all(axis=1)]
-        camera = {name: (float(known[i, 0]), float(known[i, 1])) for name, end in named.items() for i in (0 if end == "first" else -1,)}
-        fixed = [end for end in ends.values() if not isinstance(end, str)]
-        found = planner.nearest_room(grid, list(camera.values()), radius=radius, allow_unknown=allow_unknown, fixed=fixed)
-        for name, place in zip(named, found, strict=True):
-            ends[name] = place
-            off = float(np.hypot(place[0] - camera[name][0], place[1] - camera[name][1]))
-            if off > float(grid.resolution):
-                click.echo(
-                    f"{name}: {place[0]:.2f},{place[1]:.2f}, the nearest place with room, {off:.2f} m from below the camera", err=True
-                )
-    return ends["start"], ends["goal"]  # type: ignore[return-value]
+    given = {"start": start, "goal": goal}
+    places = {name: end for name, end in given.items() if not isinstance(end, str)}
+    if len(places) == len(given):
+        return places["start"], places["goal"]
+    if path is None:
+        raise SlamError("--map: a map file does not tell where a camera was; give --start and --goal as x,y")
+    known = path[np.isfinite(path).all(axis=1)]
+    cameras = {name: known[0 if end == "first" else -1, :2] for name, end in given.items() if isinstance(end, str)}
+    found = planner.nearest_room(
+        grid, [(float(x), float(y)) for x, y in cameras.values()], radius=radius, allow_unknown=allow_unknown, fixed=list(places.values())
+    )
+    for (name, camera), place in zip(cameras.items(), found, strict=True):
+        off = float(np.linalg.norm(camera - place))
+        if off > float(grid.resolution):
+            click.echo(f"{name}: {place[0]:.2f},{place[1]:.2f}, the nearest place with room, {off:.2f} m from below the camera", err=True)
+        places[name] = place
+    return places["start"], places["goal"]
 
 
 def _csv(route: Route) -> str:

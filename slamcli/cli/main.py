@@ -14,7 +14,9 @@ LACKING = ("Cannot allocate", "failed to map", "start new thread", "load shared 
 TOPICS = (
     "run",
     "batch",
+    "runs",
     "evaluate",
+    "compare",
     "export",
     "maps",
     "grid",

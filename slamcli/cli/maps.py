@@ -170,7 +170,8 @@ def _draw_octree(folder: RunDir, view: View, path: np.ndarray | None) -> np.ndar
 
 
 def _camera_path(folder: RunDir) -> np.ndarray:
-    from slamcli.schema import Features, Ground, Map, Tracks, trajectory
+    """Give the camera centres (N, 3) of the frames that have a pose, in the level frame."""
+    from slamcli.runs import placement
+    from slamcli.schema import Ground
 
-    poses = trajectory(folder.load(Features, "extract").stamp, folder.load(Tracks, "loop"), folder.load(Map, "loop"))
-    return (folder.load(Ground, "densify").T_lw @ poses.T_wc)[:, :3, 3]
+    return (folder.load(Ground, "densify").T_lw @ placement.camera_poses(folder))[:, :3, 3]

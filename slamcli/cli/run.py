@@ -2,11 +2,12 @@
 
 import json
 import os
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from slamcli.cli.common import config_option, json_option, recording_options, run_option, set_option
+from slamcli.cli.common import complete_target, config_option, json_option, recording_options, run_option, set_option
 from slamcli.stages import NAMES, STAGES, Stage
 
 if TYPE_CHECKING:
@@ -20,7 +21,7 @@ STAGE = click.Choice(NAMES)
 
 
 @click.command("run")
-@click.argument("target", required=False)
+@click.argument("target", required=False, shell_complete=complete_target)
 @click.option("-r", "--run", metavar="DIR", help="Where the run goes. [default: $SLAMCLI_RUN, else runs/<recording>]")
 @click.option("--data", metavar="DIR", help="Where recordings lie. [default: $SLAMCLI_DATA, else ./data]")
 @recording_options
@@ -127,11 +128,12 @@ def _look(dataset: "Dataset") -> None:
 def _stage_command(stage: Stage) -> click.Command:
     @click.command(stage.name, short_help=stage.help, help=_stage_help(stage))
     @run_option
+    @config_option
     @set_option
-    def command(run: str | None, assignments: tuple[str, ...]) -> None:
+    def command(run: str | None, config_name: str | None, assignments: tuple[str, ...]) -> None:
         from slamcli import api, console
 
-        api.open_run(run).run_stage(stage.name, settings=assignments, progress=console.progress, tell=console.say)
+        api.open_run(run).run_stage(stage.name, settings=assignments, config=config_name, progress=console.progress, tell=console.say)
 
     return command
 
@@ -193,14 +195,19 @@ def _state_table(rundir: "RunDir", states: "dict[str, State]") -> str:
 @config_option
 @set_option
 @click.option("--defaults", is_flag=True, help="Show the defaults, whatever run there is.")
-@click.option("--explain", is_flag=True, help="Show what each option means, its unit and its bounds.")
+@click.option("--explain", is_flag=True, help="Show what each option means, its unit and bounds; finds options by any word.")
+@click.option("--changed", is_flag=True, help="Show only what differs from the defaults.")
+@json_option
 def config_command(
-    names: tuple[str, ...], run: str | None, config_name: str | None, assignments: tuple[str, ...], defaults: bool, explain: bool
-) -> None:
+    names: tuple[str, ...], run: str | None, config_name: str | None, assignments: tuple[str, ...], defaults: bool, explain: bool,
+    changed: bool, as_json: bool,
+) -> None:  # fmt: skip
     """Show the configuration of the run as TOML; of a run to be, where there is none yet.
 
     \b
+      slamcli config --changed
       slamcli config --explain track
+      slamcli config --explain floor         every option that has to do with it
       slamcli config extract.features
     """
     from slamcli.config import toml
@@ -210,4 +217,13 @@ def config_command(
     has_run = run or os.environ.get("SLAMCLI_RUN") or LATEST.exists()
     base = RunDir.find(run).config() if has_run and not defaults else Config()
     config = toml.resolve(base, config_name, assignments)
-    click.echo(toml.dump(config, explain=explain, only=names), nl=False)
+    if as_json:
+        click.echo(json.dumps(asdict(config), indent=1))
+        return
+    only = toml.find_options(names) if explain else list(names)
+    if changed:
+        only = [name for name in toml.changed(config) if not only or name in only or name.partition(".")[0] in only]
+        if not only:
+            click.echo("# nothing differs from the defaults")
+            return
+    click.echo(toml.dump(config, explain=explain, only=only, with_defaults=changed), nl=False)

@@ -36,26 +36,22 @@ class RecordingConfig:
     """Which part of the recording is used, and how what it does not say is filled in; no stage declares it: it changes the recording."""
 
     start: float = option(0.0, "time after the first frame at which to begin [s]", ge=0)
-    end: float = option(0.0, "time after the first frame at which to stop; 0 = at the last one [s]", ge=0)
+    end: float = option(0.0, "time after the first frame at which to stop; 0 = never [s]", ge=0)
     every: int = option(1, "use every n-th frame", ge=1)
-    fps: float = option(0.0, "frame rate of a recording whose stamps are missing or no clock; 0 = 30 [Hz]", ge=0, le=1000)
-    known_camera: str = option(
-        "", 'name of a known camera whose nominal intrinsics are used, such as "kinect1" or "d435"; "" = the recording\'s own'
-    )
-    full_size: bool = option(
-        False, "use pictures of more than a megapixel as they are, instead of reduced to about 640 px: 3 to 9 times the time"
-    )
+    fps: float = option(0.0, "frame rate of a recording without stamps; 0 = 30 [Hz]", ge=0, le=1000)
+    known_camera: str = option("", 'known camera whose nominal intrinsics are used, such as "d435"; "" = the recording\'s own')
+    full_size: bool = option(False, "use pictures of more than a megapixel whole, not reduced to about 640 px")
 
 
 @dataclass(frozen=True)
 class SensorConfig:
     """The depth camera's noise and what a measurement is worth; shared by track, optimize, loop."""
 
-    depth_noise_base: float = option(0.008, "sigma_z = base + quadratic * (z - 0.4)^2 [m]", gt=0)
-    depth_noise_quadratic: float = option(0.008, "the growth of sigma_z with distance [1/m]", ge=0)
+    depth_noise_base: float = option(0.008, "depth sigma at 0.4 m, with the errors of calibration and poses [m]", gt=0)
+    depth_noise_quadratic: float = option(0.008, "growth of the depth sigma with (z - 0.4 m)^2 [1/m]", ge=0)
     pixel_noise: float = option(1.0, "sigma of a key point at octave 0 [px]; grows with the octave's scale", gt=0)
     depth_min: float = option(0.3, "nearer readings are ignored [m]", ge=0)
-    depth_max: float = option(8.0, "farther readings are ignored [m]", gt=0)
+    depth_max: float = option(8.0, "farther readings are ignored; a new value moves the ranges of later stages along [m]", gt=0)
 
 
 @dataclass(frozen=True)
@@ -65,63 +61,61 @@ class ExtractConfig:
     features: int = option(1000, "key points wanted per frame", ge=50, le=20000)
     levels: int = option(
         8,
-        "pyramid levels; 4 to 10 change the number of correct matches between near frames by 4 % at most",
+        "pyramid levels",
         ge=1,
         le=12,
     )
     scale: float = option(1.2, "scale between pyramid levels", gt=1.0, le=2.0)
     cell: int = option(
         30,
-        "cell side for FAST [px of the level]; 60: 9 % more repeatable, but 13 to 21 % fewer places of the image with a feature, and APE 5 to 10 % higher",
+        "side of the cells in which corners are sought [px of the level]",
         ge=8,
         le=200,
     )
-    smooth: bool = option(True, "seek corners in a copy blurred by 1 px, against sensor noise: 10 to 20 % more correct matches")
+    smooth: bool = option(True, "seek corners in a copy blurred by 1 px, against sensor noise")
     fast_threshold: int = option(
         8,
-        "FAST threshold [grey levels], of the blurred copy if there is one; 20: 12 % fewer features and 13 % fewer correct matches where texture is poor",
+        "FAST threshold of a corner, in the blurred copy if there is one [grey levels]",
         ge=1,
         le=255,
     )
     fast_threshold_low: int = option(
         5,
-        "threshold where a cell stays empty [grey levels]; 3: 1 to 5 % less repeatable; 8: 1 to 4 % more, but 4 to 9 % fewer places with a feature",
+        "FAST threshold in cells that fast_threshold leaves empty [grey levels]",
         ge=1,
         le=255,
     )
     pool: float = option(
         1.3,
-        "strongest corners kept for each key point wanted, before they are spread; 0 = all: evener, 10 % fewer correct matches",
+        "strongest corners kept for each key point wanted, before spreading; 0 = all",
         ge=0,
         le=100,
     )
     weak: float = option(
         0.13,
-        "corners of cells without a strong one, the strongest first, are at most this share of those kept where there are enough others; 1: 3 % less APE on the real recordings, the same in simulated rooms, and in one of two corridors a third of it, but fewer points are found again ten frames on than of OpenCV's ORB",
+        "greatest share of corners from cells without a strong one, where others suffice",
         ge=0,
         le=1,
     )
     rank_by: str = option(
         "fast",
-        "corners are ranked by their FAST score or by the sum of differences, [Z] (1): as good, a kernel more",
+        "corners are ranked by their FAST score or the sum of differences, [Z] (1)",
         choices=("fast", "sum"),
     )
     subpixel: bool = option(
         True,
-        "place key points at the summit of the FAST score instead of at whole pixels of their level: 0.37 instead of 0.84 px median error in a simulated room",
+        "place key points at the summit of the FAST score, not at whole pixels",
     )
-    depth_window: int = option(
-        1, "depth is the nearest pixel's, or the median of 3 x 3 or 5 x 5 [px]; 3: APE the same within 2 %", choices=(1, 3, 5)
-    )
+    depth_window: int = option(1, "side of the window whose median is a key point's depth [px]", choices=(1, 3, 5))
     depth_jump: float = option(
         0.03,
-        "a key point has no depth where something beside it is nearer by more than this share, in an image 640 px wide: that outline hides its surface; 0 = all have: up to 75 % more APE in simulated rooms, the same on real recordings within their spread",
+        "no depth beside an outline nearer by more than this share; 0 = off",
         ge=0,
         le=1,
     )
     flow: bool = option(
         False,
-        "follow key points into the next image by optical flow too, for frames whose descriptors find few matches: 15 % less APE at every 8th frame where a third of the pictures is blurred, the same within 1 % where none is, and no frame found more",
+        "also follow key points by optical flow, for frames whose descriptors find few matches",
     )
 
 
@@ -131,16 +125,14 @@ class MatchConfig:
 
     method: str = option(
         "words",
-        "what is compared: features under one vocabulary node, or all: 6 % more correct matches in three times the time",
+        "compare features under one vocabulary node, or all with all",
         choices=("words", "brute"),
     )
     vocabulary: str = option("", "vocabulary file; empty = the shipped one", is_file=True)
-    node_level: int = option(
-        1, "levels below the root at which features are compared under the same node; 2: 14 % fewer correct matches", ge=0, le=12
-    )
+    node_level: int = option(1, "levels below the root at which features are compared under the same node", ge=0, le=12)
     node_margin: int = option(
         4,
-        "a feature also counts under a second node that is at most this much farther [bits]; -1 = never: 10 % fewer correct matches in 0.7 to 0.8 of the time; 8: 2 % more in 1.2 times",
+        "a second node counts too, if at most this much farther; -1 = never [bits]",
         ge=-1,
         le=256,
     )
@@ -148,9 +140,7 @@ class MatchConfig:
     max_distance: int = option(64, "descriptors farther apart are no match [bits]", ge=0, le=256)
     ratio: float = option(0.8, "the nearest must be closer than this share of the second nearest's distance", gt=0, le=1)
     check_rotation: bool = option(True, "keep only matches whose turn agrees with most others'")
-    flow_below: int = option(
-        100, "fewer matches with the frame before: those that optical flow gives are added, if extract.flow is on", ge=0
-    )
+    flow_below: int = option(100, "with fewer matches, those of optical flow are added, if extract.flow is on", ge=0)
     flow_radius: float = option(2.0, "how near to a key point the flow of its partner ends [px]", gt=0)
 
 
@@ -168,18 +158,12 @@ class TrackConfig:
     local_key_frames: int = option(20, "key frames whose landmarks are looked for in a frame", ge=1)
     relocalise_candidates: int = option(5, "key frames tried after loss, best word score first", ge=1)
     relocalise_inliers: int = option(45, "landmarks that must agree to recognise a place after loss; as for a closure", ge=4)
-    segment_after: int = option(
-        10, "frames lost in a row, blank ones not counted, at which a new map segment begins with the first of them; 0 = never", ge=0
-    )
+    segment_after: int = option(10, "frames lost in a row at which a new map segment begins; 0 = never", ge=0)
     key_frame_share: float = option(0.6, "a frame that holds less of its reference key frame's landmarks becomes one", gt=0, le=1)
     key_frame_gap: int = option(8, "frames between key frames at most", ge=1)
-    key_frame_crowd: int = option(12, "unless so many stand within 0.1 m and 6 degrees of the frame already", ge=1)
-    shape_below: int = option(
-        150, "a pose that rests on fewer landmarks is found by aligning the shapes that depth shows; 0 = only where features fail", ge=0
-    )
-    shape_hold: float = option(
-        1.0, "where shape leaves a direction open, as along a flat wall, it is taken from the motion before it for so long [s]", ge=0, le=10
-    )
+    key_frame_crowd: int = option(12, "no key frame where so many stand within 0.1 m and 6 degrees already", ge=1)
+    shape_below: int = option(150, "with fewer landmarks, a frame is aligned by its depth image; 0 = without any", ge=0)
+    shape_hold: float = option(1.0, "how long motion continues in directions that depth leaves open, as along a wall [s]", ge=0, le=10)
     share_key_frames: int = option(10, "neighbours in which a new key frame's landmarks are looked for", ge=0)
     share_max_distance: int = option(50, "descriptors that differ more are not one landmark [bits]", ge=1, le=256)
     window_key_frames: int = option(12, "key frames adjusted with each new one", ge=2)
@@ -194,29 +178,27 @@ class OptimizeConfig:
     iterations: int = option(30, "rounds of global bundle adjustment at most", ge=1)
     shape_edges: int = option(
         3,
-        "earlier key frames that each one's depth image is aligned with, besides the landmarks that both see; 0 = none: 1.5 to 2.5 times the APE before loops are closed in simulated rooms, 2 to 4 % more on fr1_xyz",
+        "earlier key frames that each key frame's depth image is aligned with; 0 = none",
         ge=0,
         le=50,
     )
-    move_depth: bool = option(True, "move depth readings to the colour image's time with the camera's own motion, by what the stamps say")
+    move_depth: bool = option(True, "move depth readings to the colour image's stamp by the camera's own motion")
     readout: bool = option(
         True,
-        "find how long the camera takes to read a colour image and a depth image, and take the rolling shutters out of the measurements",
+        "find the readout times of colour and depth images, and correct for rolling shutter",
     )
-    depth_delay: bool = option(True, "find by how much depth images are older than their stamps say, and take that out too")
+    depth_delay: bool = option(True, "find by how much depth images are older than their stamps, and correct it")
     intrinsics: bool = option(
         False,
-        "find focal lengths and principal point: for a calibration that is a guess (2 % off: a tenth of the error); a good one is made worse",
+        "find focal lengths and principal point, where the calibration is a guess",
     )
     depth_scale: bool = option(
         False,
-        "find how depth readings are off: an offset of inverse depth, as of a constant error of disparity, and a factor, of which a recording says nothing; 2 % more APE on fr1_xyz, 15 % on fr3_teddy, the same in simulated rooms",
+        "find the offset of inverse depth, as of a constant error of disparity",
     )
     rounds: int = option(2, "turns of adjusting the map and finding those numbers", ge=1, le=10)
     timing_prior: float = option(0.02, "how far from 0 readout times and delay are believed to be before looking [s]", gt=0, le=1)
-    focal_prior: float = option(
-        0.02, "how far focal lengths are believed to be from the recording's calibration, as a share of them", gt=0, le=1
-    )
+    focal_prior: float = option(0.02, "standard deviation of the calibration's focal lengths, as a share of them", gt=0, le=1)
     centre_prior: float = option(5.0, "how far the principal point is believed to be from the recording's calibration [px]", gt=0, le=1000)
     depth_scale_prior: float = option(0.02, "how far the depth scale is believed to be off, as a share of it", gt=0, le=1)
     inverse_depth_prior: float = option(0.02, "how far the offset of inverse depth is believed to be off [1/m]", gt=0, le=1)
@@ -230,10 +212,8 @@ class LoopConfig:
     rounds: int = option(3, "passes of search, correction and adjustment at most; the next begins only after new closures", ge=1)
     candidates: int = option(3, "key frames looked at per key frame, best word score first", ge=1)
     min_score: float = option(0.32, "similarity of word vectors that always makes a candidate; [Z] 1.3", ge=0, le=1)
-    score_share: float = option(
-        0.6, "less similar pairs are candidates from this share of the mean score of a key frame's neighbours", ge=0, le=1
-    )
-    near: float = option(0.7, "key frames that by their poses look at spots this near each other are candidates too; 0 = none [m]", ge=0)
+    score_share: float = option(0.6, "share of the mean score of a key frame's neighbours that makes a candidate", ge=0, le=1)
+    near: float = option(0.7, "key frames that look at spots this near are candidates; 0 = off [m]", ge=0)
     min_shared: int = option(15, "key frames that share as many landmarks are joined already", ge=1)
     min_matches: int = option(20, "matches under the same words that a candidate needs", ge=4)
     min_inliers: int = option(45, "landmarks found again that an accepted closure needs; [Z] 1.3", ge=6)
@@ -243,23 +223,21 @@ class LoopConfig:
     neighbours: int = option(10, "covisible key frames whose landmarks take part in verification and fusion", ge=0)
     fuse_max_distance: int = option(50, "descriptors that differ more are not one landmark [bits]", ge=1, le=256)
     edge_shared: int = option(30, "shared landmarks that make an edge of the pose graph", ge=1)
-    edges_per_key_frame: int = option(10, "such edges per key frame at most", ge=1)
-    closure_spacing: int = option(10, "key frames around both ends of a closure within which no second one is looked for", ge=0)
+    edges_per_key_frame: int = option(10, "edges of the pose graph per key frame at most, closures and neighbours aside", ge=1)
+    closure_spacing: int = option(10, "no second closure is sought within so many key frames of one", ge=0)
     iterations: int = option(20, "rounds of each global bundle adjustment at most", ge=1)
     join_closures: int = option(2, "closures that must agree on how two map segments lie before these are joined", ge=1)
-    main_segment: int = option(0, "map segment the maps are made of, where some could not be joined: 0 = the largest", ge=0)
-    hindsight: bool = option(
-        True, "once loops are closed, match every frame again against the final map, key frames by their depth images too"
-    )
+    main_segment: int = option(0, "map segment that the maps are made of; 0 = the largest", ge=0)
+    hindsight: bool = option(True, "once loops are closed, match every frame again against the final map")
     shape_edges: int = option(
         6,
-        "earlier key frames that each one's depth image is aligned with then, besides the landmarks that both see; 0 = none: 3 to 17 % more APE in simulated rooms, 0.5 % less on fr1_xyz",
+        "earlier key frames that each depth image is then aligned with; 0 = none",
         ge=0,
         le=50,
     )
     shape_weight: float = option(
         2.0,
-        "how much those count in the last adjustment against what they count in optimize; 1: 5 to 20 % more APE in simulated rooms, 1 % less on fr1_xyz",
+        "weight of those alignments in the last adjustment; in optimize it is 1",
         gt=0,
         le=100,
     )
@@ -269,10 +247,10 @@ class LoopConfig:
 class SurfaceConfig:
     """How a depth image is cleaned; densify and octree each have these options."""
 
-    noise_base: float = option(0.0012, "sigma of one reading = base + quadratic * (z - 0.4)^2, the sensor's alone [m]", gt=0)
-    noise_quadratic: float = option(0.0019, "its growth with distance [1/m]; Nguyen, Izadi, Lovell 2012 for the Kinect", ge=0)
+    noise_base: float = option(0.0012, "sigma of one reading at 0.4 m, the sensor's alone [m]", gt=0)
+    noise_quadratic: float = option(0.0019, "growth of a reading's sigma with (z - 0.4 m)^2 [1/m]", ge=0)
     edge: int = option(2, "readings at most this far from a depth jump are dropped [px]", ge=1, le=20)
-    window: float = option(2.0, "half the window that smooths a reading and gives its normal, per metre of distance [px/m]", ge=0, le=20)
+    window: float = option(2.0, "half width of the smoothing window, per metre of distance [px/m]", ge=0, le=20)
     max_angle_deg: float = option(78.0, "surfaces seen more slantingly are dropped [degrees from the normal]", gt=0, lt=90)
 
 
@@ -286,7 +264,7 @@ class DensifyConfig(SurfaceConfig):
     depth_max: float = option(4.0, "farther readings are ignored [m]", gt=0, le=100)
     min_points: int = option(1, "voxels with fewer readings are dropped", ge=1)
     neighbours: int = option(6, "stray points are found by their mean distance to this many neighbours; 0 keeps all", ge=0, le=100)
-    max_deviation: float = option(2.0, "and dropped when it is this many standard deviations above the mean", gt=0)
+    max_deviation: float = option(2.0, "points whose mean distance is so many standard deviations above average are dropped", gt=0)
 
 
 @dataclass(frozen=True)
@@ -299,7 +277,7 @@ class GroundConfig:
     distance: float = option(0.02, "inliers lie within this of the plane, twice the depth noise added [m]", gt=0, le=1)
     min_cosine: float = option(0.94, "cosine of the tilt up to which a surface counts as horizontal", gt=0, lt=1)
     min_patches: int = option(50, "a floor has at least this many blocks in all key frames", ge=3)
-    min_share: float = option(0.01, "and at least this share of the upward-facing blocks", ge=0, le=1)
+    min_share: float = option(0.01, "a floor has at least this share of the upward-facing blocks", ge=0, le=1)
     max_below: float = option(0.05, "a floor has at most this share of its blocks below it", ge=0)
     min_height: float = option(0.05, "the camera is at least this high above the floor [m]", ge=0)
     middle: float = option(0.6, "paper: share of the image's width and height taken around its middle", gt=0, le=1)
@@ -314,7 +292,7 @@ class OctreeConfig(SurfaceConfig):
     resolution: float = option(0.05, "leaf side [m]", gt=0, le=10)
     frames: str = option(
         "auto",
-        "whose depth is inserted: key frames, all, or key frames and, where these saw something vanish, the frames that look there",
+        "whose depth is inserted: key frames', all, or also that of frames where something vanished",
         choices=("auto", "key", "all"),
     )
     stride: int = option(4, "every stride-th row and column of a depth image is used", ge=1, le=64)
@@ -332,15 +310,15 @@ class GridConfig:
 
     resolution: float = option(0.05, "cell side [m]", gt=0, le=10)
     source: str = option("points", "what the grid is made from: the key frames' depth, or the octree", choices=("points", "octree"))
-    band_low: float = option(0.05, "the robot passes over what is lower [m]", ge=0, le=10)
-    band_high: float = option(0.5, "the robot passes under what is higher [m]", gt=0, le=100)
-    spacing: float = option(0.12, "a frame is looked at when it has moved so far since the last one [m]", gt=0)
-    spacing_deg: float = option(12.0, "or turned so far [degrees]", gt=0, le=180)
+    band_low: float = option(0.05, "the robot drives over what is lower [m]", ge=0, le=10)
+    band_high: float = option(0.5, "the robot's height: what is higher is passable [m]", gt=0, le=100)
+    spacing: float = option(0.12, "a frame is used when the camera moved so far since the last one [m]", gt=0)
+    spacing_deg: float = option(12.0, "a frame is used when the camera turned so far since the last [degrees]", gt=0, le=180)
     stride: int = option(4, "every so many pixels of depth are used [px]", ge=1, le=64)
     min_range: float = option(0.3, "nearer readings are ignored [m]", ge=0)
     max_range: float = option(4.0, "farther readings are ignored [m]", gt=0, le=100)
     extend_down: bool = option(True, "an upright surface that leaves the picture downwards is taken to reach the floor")
-    driven: float = option(0.0, "floor within this of the camera's path is free: for recordings made on a robot; 0 = off [m]", ge=0, le=5)
+    driven: float = option(0.0, "floor this near the camera's path is free, on a robot; 0 = off [m]", ge=0, le=5)
     n_low: int = option(3, "n_l of (20): a cell with fewer points in a view is empty", ge=1)
     n_high: int = option(8, "n_h of (20): a cell with more points in a view is occupied", ge=1)
     update: str = option("evidence", "how views add up: log-odds, or (22), (23) as printed", choices=("evidence", "paper"))
@@ -348,7 +326,7 @@ class GridConfig:
     p_full_empty: float = option(0.1, "P(F1|E2) of (22)", gt=0, lt=1)
     blend: float = option(0.5, "lambda of (23)", ge=0, le=1)
     p_floor: float = option(0.01, "probabilities are kept this far from 0 and 1", gt=0, lt=0.5)
-    m_low: float = option(0.05, "m_l of (24): free below; 0.05 asks for two views, as one may be a slip", gt=0, lt=1)
+    m_low: float = option(0.05, "m_l of (24): cells below are free; 0.05 asks for two views", gt=0, lt=1)
     m_high: float = option(0.6, "m_h of (24): occupied above", gt=0, lt=1)
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, get_args, get_origin, get_type_hints
 
 from slamcli import files
+from slamcli.config import ranges
 from slamcli.config.options import Config
 from slamcli.errors import SlamError
 
@@ -63,7 +64,7 @@ def parse(text: bytes, base: Config | None = None, *, source: str) -> Config:
 
 
 def merge(base: Config, values: Mapping[str, Any], *, source: str) -> Config:
-    """Lay nested `values` over `base`; SlamError names `source` and the key at fault."""
+    """Lay nested `values` over `base`; SlamError names `source` and the key at fault. Ranges follow the sensor's reach, see `ranges`."""
     changes: dict[str, Any] = {}
     for name, value in values.items():
         if name == "camera" and isinstance(value, Mapping):
@@ -77,7 +78,8 @@ def merge(base: Config, values: Mapping[str, Any], *, source: str) -> Config:
             raise _unknown(f"{name}.{next(iter(value))}", source)
         else:
             changes[name] = _value(Config, "", name, value, source)
-    return dataclasses.replace(base, **changes)
+    given = {f"{name}.{key}" for name, value in values.items() if isinstance(value, Mapping) for key in value}
+    return ranges.follow(base, dataclasses.replace(base, **changes), given)
 
 
 def apply(base: Config, assignments: Iterable[str]) -> Config:
@@ -131,7 +133,17 @@ def _camera_keys() -> list[str]:
     return [spec.name for spec in dataclasses.fields(Camera)]
 
 
-def _known_keys() -> list[str]:
+def choices(name: str) -> list[str]:
+    """List the values that an option may have, where these can be listed; its full name is given."""
+    section, _, key = name.partition(".")
+    spec = next((spec for spec in dataclasses.fields(_sections().get(section, Config)) if spec.name == key), None)
+    if spec is None or "choices" not in spec.metadata:
+        return []
+    return ["true", "false"] if isinstance(spec.default, bool) else [str(value) for value in spec.metadata["choices"]]
+
+
+def known_keys() -> list[str]:
+    """List every option by its full name."""
     keys = [spec.name for spec in dataclasses.fields(Config) if spec.name != "camera" and not _is_section(spec)]
     keys += [f"camera.{key}" for key in _camera_keys()]
     return keys + [f"{name}.{spec.name}" for name, section in _sections().items() for spec in dataclasses.fields(section)]
@@ -139,7 +151,7 @@ def _known_keys() -> list[str]:
 
 def _unknown(key: str, source: str) -> SlamError:
     """Build the error for a key nobody declared, with those that may be meant: the same option of a section, else the nearest name."""
-    known = _known_keys()
+    known = known_keys()
     near = [name for name in known if name.rpartition(".")[2] == key.rpartition(".")[2]]
     if "." in key:
         near = difflib.get_close_matches(key, near, n=1, cutoff=0.0)
@@ -212,44 +224,105 @@ def _typed_tuple(expected: tuple, value: Any, origin: str) -> tuple:
     return tuple(_typed(kind, item, origin) for kind, item in zip(expected, value, strict=True))
 
 
-def dump(config: Config, *, explain: bool = False, only: Sequence[str] = ()) -> str:
+def changed(config: Config) -> list[str]:
+    """List the full names of the options that differ from the defaults, and camera where anything of it is overridden."""
+    defaults = Config()
+    names = [name for name in known_keys() if not name.startswith("camera.") and _get(config, name) != _get(defaults, name)]
+    return names + (["camera"] if config.camera else [])
+
+
+def _get(config: Config, name: str) -> Any:
+    section, dot, key = name.partition(".")
+    return getattr(getattr(config, section), key) if dot else getattr(config, section)
+
+
+def find_options(words: Sequence[str]) -> list[str]:
+    """List what `config --explain` is asked for: sections and options by name, else those whose name or help has the word.
+
+    Raises SlamError for a word that occurs nowhere, with the option that may be meant.
+    """
+    found: list[str] = []
+    for word in words:
+        if word in _sections() or word in known_keys() or word == "camera":
+            found.append(word)
+            continue
+        hits = [name for name, help_text in _help().items() if word.lower() in name.lower() or word.lower() in help_text.lower()]
+        if not hits:
+            raise _unknown(word, "config")
+        found += hits
+    return found
+
+
+def _help() -> dict[str, str]:
+    """Return the help of every option by its full name."""
+    plain = {spec.name: spec.metadata["help"] for spec in dataclasses.fields(Config) if "help" in spec.metadata}
+    return plain | {
+        f"{name}.{spec.name}": spec.metadata["help"] for name, section in _sections().items() for spec in dataclasses.fields(section)
+    }
+
+
+def dump(config: Config, *, explain: bool = False, only: Sequence[str] = (), with_defaults: bool = False) -> str:
     """Write every value as TOML that `read` takes back.
 
     explain : put each option's help, bounds and choices above it
+    with_defaults : tell in a comment what the default is, where a value differs from it
     only : sections ("track") and options ("track.min_inliers") to write; all of them when empty
     """
     for name in only:
-        if name not in _known_keys() and name not in _sections() and name != "camera":
+        if name not in known_keys() and name not in _sections() and name != "camera":
             raise _unknown(name, "config")
-    blocks = [_block("", Config, config, explain, only)]
-    blocks += [_block(name, section, getattr(config, name), explain, only) for name, section in _sections().items()]
+    told = Told(explain=explain, with_defaults=with_defaults)
+    blocks = [_block("", Config, config, told, only)]
+    blocks += [_block(name, section, getattr(config, name), told, only) for name, section in _sections().items()]
     if not only or any(name.partition(".")[0] == "camera" for name in only):
         values = [f"{key} = {_toml(config.camera[key])}" for key in _camera_keys() if key in config.camera]
         blocks.append(["[camera]  # overrides the recording's calibration; keys: " + " ".join(_camera_keys()), *values])
     return "\n\n".join("\n".join(block) for block in blocks if block) + "\n"
 
 
-def _block(name: str, section: type, values: Any, explain: bool, only: Sequence[str]) -> list[str]:
+@dataclasses.dataclass(frozen=True)
+class Told:
+    """What is told of an option beside its value."""
+
+    explain: bool
+    with_defaults: bool
+
+    @functools.cached_property
+    def presets(self) -> dict[str, Config]:
+        """Return the shipped configurations that differ from the defaults."""
+        return {name: read(_shipped_folder() / f"{name}.toml") for name in shipped() if name != "default"}
+
+    def lines(self, name: str, spec: dataclasses.Field, value: Any) -> Iterator[str]:
+        """Write an option as TOML, with what is to be told of it in comments."""
+        if self.explain:
+            meta = spec.metadata
+            notes = [f"{COMPARISONS[bound][0]} {limit}" for bound, limit in meta["bounds"].items()]
+            notes += [" | ".join(map(str, meta["choices"]))] if meta["choices"] else []
+            notes += [
+                f"{preset}: {_toml(_get(config, name))}" for preset, config in self.presets.items() if _get(config, name) != spec.default
+            ]
+            yield f"# {meta['help']}" + (f"; {', '.join(notes)}" if notes else "")
+        default = f"  # default: {_toml(spec.default)}" if self.with_defaults and value != spec.default else ""
+        yield f"{spec.name} = {_toml(value)}{default}"
+
+
+def _block(name: str, section: type, values: Any, told: Told, only: Sequence[str]) -> list[str]:
     """Write the options of one section that are wanted, under its heading."""
     lines: list[str] = []
     for spec in dataclasses.fields(section):
         key = f"{name}.{spec.name}" if name else spec.name
         if spec.name != "camera" and not _is_section(spec) and (not only or name in only or key in only):
-            lines += _option_lines(spec, getattr(values, spec.name), explain)
+            lines += told.lines(key, spec, getattr(values, spec.name))
     return [f"[{name}]  # {_first_line(section)}", *lines] if lines and name else lines
-
-
-def _option_lines(spec: dataclasses.Field, value: Any, explain: bool) -> Iterator[str]:
-    if explain:
-        meta = spec.metadata
-        limits = [f"{COMPARISONS[bound][0]} {limit}" for bound, limit in meta["bounds"].items()]
-        limits += [" | ".join(map(str, meta["choices"]))] if meta["choices"] else []
-        yield f"# {meta['help']}" + (f"; {', '.join(limits)}" if limits else "")
-    yield f"{spec.name} = {_toml(value)}"
 
 
 def _first_line(section: type) -> str:
     return (section.__doc__ or "").strip().splitlines()[0]
+
+
+def as_text(value: Any) -> str:
+    """Write a value as TOML, or a dash where there is none."""
+    return "-" if value is None else _toml(value)
 
 
 def _toml(value: Any) -> str:

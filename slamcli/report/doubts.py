@@ -122,11 +122,12 @@ def _floor(content: Content) -> list[Remark]:
 
 def _stages(content: Content) -> list[Remark]:
     found = []
+    unfit: dict[tuple[str, str], list[str]] = {}
     for stage, state in content.states.items():
         if state.state == MISSING:
             found.append(Remark(NOTE, f"{stage} has not been run; go on with: slamcli run {content.flag}"))
         elif not state.is_fresh:
-            found.append(Remark(BAD, f"{stage} is {state.state} ({state.reason}); bring it up to date with: slamcli run {content.flag}"))
+            unfit.setdefault((state.state, state.reason), []).append(stage)
         warnings = [
             text
             for text in state.record.get("warnings", [])
@@ -136,6 +137,9 @@ def _stages(content: Content) -> list[Remark]:
         if len(warnings) > MOST_STAGE_WARNINGS:
             total = state.record.get("n_warnings", len(warnings))
             found.append(Remark(NOTE, f"{stage}: {total} warnings in all; they are in log.txt"))
+    for (state_name, reason), stages in unfit.items():
+        told = f"{', '.join(stages)} {'is' if len(stages) == 1 else 'are'} {state_name} ({reason})"
+        found.append(Remark(BAD, f"{told}; bring up to date with: slamcli run {content.flag}"))
     return found
 
 

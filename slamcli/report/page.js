@@ -3,7 +3,7 @@
   const data = JSON.parse(document.getElementById("data").textContent);
   const n = data.time.length;
   const RAMP = [[59, 76, 192], [98, 160, 220], [120, 198, 121], [253, 191, 80], [200, 40, 40]];
-  const INK = "#1d2329", SOFT = "#5d6873", LINE = "#e3e7eb", BLUE = "#0072b2", LOST = "rgba(194,59,34,0.14)", LOOP = "#d55e00", KEY = "#17212b";
+  const INK = "#1d2329", SOFT = "#5d6873", LINE = "#e3e7eb", BLUE = "#0072b2", LOST = "rgba(194,59,34,0.14)", LOOP = "#d55e00", KEY = "#17212b", START = "#00805e";
   const hasPose = i => data.position[0][i] !== null;
   let cursor = -1;
   const listeners = [];
@@ -67,12 +67,6 @@
     for (let y = low[1]; y <= high[1] + 1e-9; y += step) line([at(low[0], y, floor), at(high[0], y, floor)], LINE, 1);
     context.fillStyle = SOFT; context.font = "11px sans-serif";
     context.fillText("squares of " + step + " m" + (isOnFloor ? " on the floor" : ", " + floor.toFixed(2) + " m " + (data.hasFloor ? "above the floor" : "high")), 10, height - 9);
-    const axes = [[[1, 0, 0], "x"], [[0, 1, 0], "y"], [[0, 0, 1], "z"]];
-    axes.forEach(([d, name]) => {
-      const origin = [low[0], low[1], floor], tip = origin.map((v, k) => v + d[k] * step * 0.7), end = at(...tip);
-      line([at(...origin), end], SOFT, 1.5);
-      context.fillText(name, end[0] + 3, end[1] - 2);
-    });
     const truth = data.truth[0].map((x, i) => at(x, data.truth[1][i], data.truth[2][i]));
     if (truth.length) line(truth, "#8a949e", 1.6, [5, 4]);
     context.setLineDash([]);
@@ -88,9 +82,38 @@
       const p = point(i);
       context.beginPath(); context.arc(p[0], p[1], 1.7, 0, 2 * Math.PI); context.fill();
     }
-    const first = data.position[0].findIndex(x => x !== null);
-    if (first >= 0) { const p = point(first); context.fillStyle = "#00805e"; context.fillText("start", p[0] + 6, p[1] - 6); }
+    drawStart(context, at, line);
+    drawGizmo(context, width, line);
     if (cursor >= 0 && hasPose(cursor)) drawCamera(context, at, cursor, line);
+  };
+
+  // Where the recording began and which way the camera looked: the initial pose of a robot.
+  const drawStart = (context, at, line) => {
+    const first = data.position[0].findIndex(x => x !== null);
+    if (first < 0) return;
+    const p = [0, 1, 2].map(k => data.position[k][first]), f = [0, 1].map(k => data.forward[k][first]);
+    const norm = Math.hypot(f[0], f[1]);
+    const a = at(...p);
+    context.fillStyle = START; context.beginPath(); context.arc(a[0], a[1], 4, 0, 2 * Math.PI); context.fill();
+    if (norm > 0.2) {
+      const d = [f[0] / norm, f[1] / norm], s = 0.14 * size / Math.sqrt(view.zoom);
+      const to = (x, y) => at(p[0] + s * (x * d[0] - y * d[1]), p[1] + s * (x * d[1] + y * d[0]), p[2]);
+      line([a, to(1, 0)], START, 2.4);
+      line([to(0.72, 0.16), to(1, 0), to(0.72, -0.16)], START, 2.4);
+    }
+    context.fillText("start", a[0] + 7, a[1] + 15);
+  };
+
+  // The axes, in the corner where nothing hides them.
+  const drawGizmo = (context, width, line) => {
+    const ca = Math.cos(view.azimuth), sa = Math.sin(view.azimuth), ce = Math.cos(view.elevation), se = Math.sin(view.elevation);
+    const origin = [width - 42, 42], reach = 26;
+    [[[1, 0, 0], "x", "#c23b22"], [[0, 1, 0], "y", "#00805e"], [[0, 0, 1], "z", BLUE]].forEach(([d, name, colour]) => {
+      const tip = [origin[0] + reach * (-sa * d[0] + ca * d[1]), origin[1] - reach * (-se * (ca * d[0] + sa * d[1]) + ce * d[2])];
+      line([origin, tip], colour, 2);
+      context.fillStyle = colour;
+      context.fillText(name, tip[0] + (tip[0] < origin[0] ? -10 : 4), tip[1] + 3);
+    });
   };
 
   const drawCamera = (context, at, i, line) => {
@@ -104,27 +127,58 @@
     corners.forEach(p => line([at(...c), p], INK, 1.2));
   };
 
+  const turn = (dx, dy) => {
+    view.azimuth -= 0.008 * dx;
+    view.elevation = Math.min(Math.max(view.elevation + 0.008 * dy, -0.2), 1.5707);
+  };
+  const shift = (dx, dy) => {
+    const unit = size / (view.zoom * Math.min(scene.clientWidth, scene.clientHeight) * 0.82);
+    const ca = Math.cos(view.azimuth), sa = Math.sin(view.azimuth), se = Math.sin(view.elevation), ce = Math.cos(view.elevation);
+    view.target[0] += unit * (sa * dx - se * ca * dy);
+    view.target[1] += unit * (-ca * dx - se * sa * dy);
+    view.target[2] += unit * ce * dy;
+  };
+  const zoom = factor => { view.zoom = Math.min(Math.max(view.zoom * factor, 0.3), 40); };
+
+  // A mouse or a pen turns; one finger scrolls the page, two turn and zoom; the wheel scrolls unless Ctrl is held, as when pinching a touchpad.
   const dragging = { active: false, move: false, x: 0, y: 0 };
-  scene.addEventListener("pointerdown", e => { Object.assign(dragging, { active: true, move: e.shiftKey || e.button === 1, x: e.clientX, y: e.clientY }); scene.setPointerCapture(e.pointerId); });
-  scene.addEventListener("pointerup", () => { dragging.active = false; });
+  const stopDragging = () => { dragging.active = false; };
+  scene.addEventListener("pointerdown", e => {
+    if (e.pointerType === "touch") return;
+    Object.assign(dragging, { active: true, move: e.shiftKey || e.button === 1, x: e.clientX, y: e.clientY });
+    scene.setPointerCapture(e.pointerId);
+  });
+  scene.addEventListener("pointerup", stopDragging);
+  scene.addEventListener("pointercancel", stopDragging);
   scene.addEventListener("pointermove", e => {
     if (!dragging.active) return;
-    const dx = e.clientX - dragging.x, dy = e.clientY - dragging.y;
+    (dragging.move ? shift : turn)(e.clientX - dragging.x, e.clientY - dragging.y);
     dragging.x = e.clientX; dragging.y = e.clientY;
-    if (dragging.move) {
-      const unit = size / (view.zoom * Math.min(scene.clientWidth, scene.clientHeight) * 0.82);
-      const ca = Math.cos(view.azimuth), sa = Math.sin(view.azimuth), se = Math.sin(view.elevation), ce = Math.cos(view.elevation);
-      view.target[0] += unit * (sa * dx - se * ca * dy);
-      view.target[1] += unit * (-ca * dx - se * sa * dy);
-      view.target[2] += unit * ce * dy;
-    } else {
-      view.azimuth -= 0.008 * dx;
-      view.elevation = Math.min(Math.max(view.elevation + 0.008 * dy, -0.2), 1.5707);
-    }
     drawScene();
   });
-  scene.addEventListener("wheel", e => { e.preventDefault(); view.zoom = Math.min(Math.max(view.zoom * Math.exp(-0.0015 * e.deltaY), 0.3), 40); drawScene(); }, { passive: false });
-  scene.addEventListener("dblclick", () => { view = start(); drawScene(); });
+  let pinch = null;
+  const pinchOf = touches => {
+    const [a, b] = [touches[0], touches[1]];
+    return { x: (a.clientX + b.clientX) / 2, y: (a.clientY + b.clientY) / 2, d: Math.hypot(a.clientX - b.clientX, a.clientY - b.clientY) || 1 };
+  };
+  const startPinch = e => { if (e.touches.length === 2) { e.preventDefault(); pinch = pinchOf(e.touches); } else pinch = null; };
+  scene.addEventListener("touchstart", startPinch, { passive: false });
+  scene.addEventListener("touchmove", e => {
+    if (e.touches.length !== 2 || pinch === null) return;
+    e.preventDefault();
+    const now = pinchOf(e.touches);
+    turn(now.x - pinch.x, now.y - pinch.y);
+    zoom(now.d / pinch.d);
+    pinch = now;
+    drawScene();
+  }, { passive: false });
+  ["touchend", "touchcancel"].forEach(name => scene.addEventListener(name, startPinch, { passive: false }));
+  scene.addEventListener("wheel", e => { if (!e.ctrlKey) return; e.preventDefault(); zoom(Math.exp(-0.01 * e.deltaY)); drawScene(); }, { passive: false });
+  const reset = () => { view = start(); drawScene(); };
+  scene.addEventListener("dblclick", reset);
+  document.getElementById("zoom-in").addEventListener("click", () => { zoom(1.4); drawScene(); });
+  document.getElementById("zoom-out").addEventListener("click", () => { zoom(1 / 1.4); drawScene(); });
+  document.getElementById("zoom-reset").addEventListener("click", reset);
   listeners.push(drawScene);
 
   const legend = document.getElementById("legend");
@@ -143,9 +197,14 @@
   // The charts: one time axis for all.
   const last = data.time[n - 1] || 1e-3;
   let range = [0, last];
-  const charts = [];
+  const charts = [], constant = [];
   const LEFT = 52, RIGHT = 8, TOP = 20, BOTTOM = 18;
   const addChart = (title, values, unit, digits, factor) => {
+    const known = finite(values);
+    if (known.length && known[0] === known[known.length - 1]) {  // a line that says one number is better said in words
+      constant.push(title + ": " + (known[0] * factor).toFixed(digits) + (unit ? " " + unit : "") + " in every frame");
+      return;
+    }
     const canvas = document.createElement("canvas");
     document.getElementById("charts").append(canvas);
     charts.push({ canvas, title, values, unit, digits, factor });
@@ -154,6 +213,8 @@
   addChart("landmarks a pose rests on", data.inliers, "", 0, 1);
   addChart("features", data.features, "", 0, 1);
   if (!data.error.length) addChart("height of the camera", data.position[2], "m", 2, 1);
+
+  document.getElementById("constant").textContent = constant.join("; ");
 
   const drawChart = chart => {
     const [context, width, height] = fit(chart.canvas);
@@ -217,7 +278,7 @@
       if (anchor !== null) { selection = [Math.min(anchor, e.offsetX), Math.max(anchor, e.offsetX)]; drawCharts(); }
       moveCursor(frameAt(timeAt(chart, e.offsetX)));
     });
-    canvas.addEventListener("pointerdown", e => { anchor = e.offsetX; canvas.setPointerCapture(e.pointerId); });
+    canvas.addEventListener("pointerdown", e => { anchor = e.offsetX; moveCursor(frameAt(timeAt(chart, e.offsetX))); if (e.pointerType !== "touch") canvas.setPointerCapture(e.pointerId); });
     canvas.addEventListener("pointerup", () => {
       if (selection && selection[1] - selection[0] > 6) {
         const [a, b] = [Math.max(timeAt(chart, selection[0]), 0), Math.min(timeAt(chart, selection[1]), last)];
@@ -226,9 +287,19 @@
       anchor = selection = null;
       drawCharts();
     });
+    canvas.addEventListener("pointercancel", () => { anchor = selection = null; drawCharts(); });  // the finger scrolls the page instead
     canvas.addEventListener("pointerleave", () => { if (anchor === null) moveCursor(-1); });
     canvas.addEventListener("dblclick", () => { range = [0, last]; drawCharts(); });
   });
+
+  // Pictures enlarge on a click; another click, or Escape, closes them.
+  const large = document.getElementById("large"), largeImage = large.querySelector("img");
+  document.querySelectorAll("figure img").forEach(image => {
+    const open = () => { largeImage.src = image.src; largeImage.alt = image.alt; large.showModal(); };
+    image.addEventListener("click", open);
+    image.addEventListener("keydown", e => { if (e.key === "Enter" || e.key === " ") { e.preventDefault(); open(); } });
+  });
+  large.addEventListener("click", () => large.close());
 
   const drawAll = () => { drawScene(); drawCharts(); };
   window.addEventListener("resize", drawAll);

@@ -14,6 +14,7 @@ import numpy as np
 
 from slamcli import __version__
 from slamcli.config.options import Config
+from slamcli.console import counts
 from slamcli.evaluation.run_content import Content
 from slamcli.evaluation.trajectory_error import Ape
 from slamcli.report import doubts
@@ -39,13 +40,14 @@ def render(content: Content, pictures: list[Picture], inspected: Sequence[tuple[
         "versions": _pairs(_versions(content)),
         "made": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
         "data": json.dumps(_data(content), separators=(",", ":"), allow_nan=False).replace("<", "\\u003c"),
-        "style": _resource("page.css"),
-        "script": _resource("page.js"),
+        "style": resource("page.css"),
+        "script": resource("page.js"),
     }
-    return re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found.group(1)], _resource("page.html"))
+    return re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found.group(1)], resource("page.html"))
 
 
-def _resource(name: str) -> str:
+def resource(name: str) -> str:
+    """Read a file of this package."""
     return resources.files(__package__).joinpath(name).read_text(encoding="utf-8")
 
 
@@ -95,9 +97,9 @@ def _cards(content: Content) -> str:
         ("time per frame", f"{1000 * seconds / n:.0f} ms"),
         ("peak memory", f"{max(record.get('peak_rss_mb', 0.0) for record in records):.0f} MiB"),
     ]
-    is_doubtful = content.verdict is not None and not content.verdict.is_usable
+    is_amber = content.verdict is not None and not content.verdict.is_usable
     return "".join(
-        f'<div class="card{" amber" if name == "free floor" and is_doubtful else ""}"><b>{html.escape(_thousands(value))}</b><span>{name}</span></div>'
+        f'<div class="card{" amber" if name == "free floor" and is_amber else ""}"><b>{html.escape(_thousands(value))}</b><span>{name}</span></div>'
         for name, value in cards
         if value is not None
     )
@@ -145,19 +147,11 @@ def _timings(content: Content) -> str:
         bars.append(f'<i style="width:{100 * seconds[stage] / total:.2f}%" class="c{k}" title="{stage}: {seconds[stage]:.1f} s"></i>')
         rate = f"{n / seconds[stage]:.1f}" if seconds[stage] > 0 else "-"
         cells = [f"{seconds[stage]:.2f}", f"{cpu[stage]:.2f}", f"{compiling[stage]:.2f}", rate, f"{record.get('peak_rss_mb', 0.0):.0f}"]
-        rows.append([f"\u25a0 {stage}", content.states[stage].state, *cells, _counts(record.get("summary", {}))])
+        rows.append([f"\u25a0 {stage}", content.states[stage].state, *cells, ", ".join(counts(record.get("summary", {})))])
     sums = [f"{total:.2f}", f"{sum(cpu.values()):.2f}", f"{sum(compiling.values()):.2f}", f"{n / total:.1f}"]
     rows.append(["total", "", *sums, "", f"{1000 * sum(cpu.values()) / n:.0f} ms CPU time a frame"])
     heading = ["stage", "state", "seconds", "CPU seconds", "compiling", "frames/s", "peak MiB", "counts"]
     return f'<div class="bar">{"".join(bars)}</div>' + _table(heading, rows, css="timings")
-
-
-def _counts(summary: dict[str, Any]) -> str:
-    plain = {key: value for key, value in summary.items() if isinstance(value, (int, float, str)) and key != "frames"}
-    return ", ".join(
-        f"{key.replace('_', ' ')} {value:.4g}" if isinstance(value, float) else f"{key.replace('_', ' ')} {value}"
-        for key, value in plain.items()
-    )
 
 
 def _configuration(content: Content) -> str:
@@ -199,7 +193,7 @@ def _by_version(stages: dict[str, list[str]]) -> str:
 
 
 def _picture(picture: Picture) -> str:
-    image = f'<img src="{picture.url}" alt="{html.escape(picture.title)}">' if picture.url else ""
+    image = f'<img src="{picture.url}" alt="{html.escape(picture.title)}" tabindex="0">' if picture.url else ""
     return f"<figure><h3>{html.escape(picture.title)}</h3>{image}<figcaption>{html.escape(picture.caption)}</figcaption></figure>"
 
 

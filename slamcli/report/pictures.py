@@ -12,6 +12,7 @@ from slamcli.evaluation.run_content import Content
 from slamcli.formats import cloud, octomap
 from slamcli.navigation import planner
 from slamcli.navigation.planner import Route
+from slamcli.runs import placement
 from slamcli.runs.run_directory import RunDir
 from slamcli.schema import Features, Grid
 from slamcli.visualization import grid_picture, render
@@ -22,7 +23,8 @@ JPEG_QUALITY = 88
 ROBOT_RADIUS = 0.2  # [m]
 WITH_DEPTH, WITHOUT_DEPTH = (60, 220, 60), (235, 60, 40)
 LEAST_ROUTE = 0.5  # [m] from start to goal, or there is nothing to show
-LONGEST_GRID = 10.0  # inches of the grid's longer side
+LONGEST_GRID = 6.0  # inches of the grid's longer side
+GRID_FONT, GRID_DPI = 10.0, 180  # [pt], [1/inch]: its numbers can be read on a phone
 
 
 @dataclass(frozen=True)
@@ -68,8 +70,13 @@ def _octree(run: RunDir, title: str, path: np.ndarray) -> Picture:
     file, small = run.stage_path("octree", "map.ot"), run.stage_path("octree", "map.bt")
     tree = octomap.read(file)
     sizes = f"map.ot {file.stat().st_size / 1e6:.2f} MB, map.bt {small.stat().st_size / 1e6:.3f} MB"
-    image = render.draw_octree(tree, view=VIEW, path=path)
-    return Picture(title, f"occupied cells of {float(tree.resolution):g} m, coloured by height; {sizes}", _jpeg(image))
+    low, high = render.octree_heights(tree)
+    image = render.draw_octree(tree, view=VIEW, path=path, with_scale=True)
+    return Picture(
+        title,
+        f"occupied cells of {float(tree.resolution):g} m, coloured by height, from {round(low, 1) + 0.0:.1f} m (blue) to {high:.1f} m (red); {sizes}",
+        _jpeg(image),
+    )
 
 
 def _grid(run: RunDir, title: str, path: np.ndarray) -> Picture:
@@ -82,9 +89,17 @@ def _grid(run: RunDir, title: str, path: np.ndarray) -> Picture:
     size = np.array([columns, rows]) / max(rows, columns) * LONGEST_GRID
     figure = Figure(figsize=tuple(np.maximum(size, 3.5) + [0.8, 1.4]))
     FigureCanvasAgg(figure)
-    grid_picture.draw(figure.add_subplot(), grid, trajectory=path, route=None if route is None else route.xy, radius=ROBOT_RADIUS)
+    grid_picture.draw(
+        figure.add_subplot(),
+        grid,
+        trajectory=path,
+        route=None if route is None else route.xy,
+        radius=ROBOT_RADIUS,
+        start=placement.read(run).first,
+        font=GRID_FONT,
+    )
     buffer = io.BytesIO()
-    figure.savefig(buffer, dpi=110, bbox_inches="tight")
+    figure.savefig(buffer, dpi=GRID_DPI, bbox_inches="tight")
     planned = f"; an example path of {route.length:.1f} m for a robot of {ROBOT_RADIUS:g} m radius" if route is not None else ""
     return Picture(title, f"{columns} x {rows} cells of {float(grid.resolution):g} m{planned}", _url("png", buffer.getvalue()))
 

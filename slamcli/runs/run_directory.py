@@ -217,11 +217,26 @@ class RunDir:
 
     def _warn_unless_fresh(self, stage: str) -> None:
         """Say once that a result is not what the run's configuration would give now."""
-        if stage not in self._warned and not (state := self.states()[stage]).is_fresh:
+        if stage in self._warned or (state := self.states()[stage]).is_fresh or self._is_cleaned(state):
+            return
+        if state.reason not in self._warned:  # of several stages that are stale for one reason, one tells it
             log.warning(
                 "%s: %s is %s (%s); bring it up to date with: slamcli run %s", self.path, stage, state.state, state.reason, self.flag
             )
-        self._warned.add(stage)
+        self._warned |= {stage, state.reason}
+
+    def mark_cleaned(self, stage: str) -> None:
+        """Remember that a stage was deleted on purpose: what was made from it still stands, and may be exported without a warning."""
+        info = self.info()
+        self._write_info({**info, "cleaned": sorted({*info.get("cleaned", []), stage})})
+
+    def _is_cleaned(self, state: State) -> bool:
+        """Tell whether a stage is stale only because stages before it were deleted on purpose."""
+        cleaned = self.info().get("cleaned", [])
+        if state.stage in cleaned and state.state == staleness.MISSING:
+            return True
+        needed = state.reason.removeprefix("input: ").partition(" is ")[0]
+        return needed in NAMES and NAMES.index(needed) < NAMES.index(state.stage) and self._is_cleaned(self.states()[needed])
 
     def states(
         self,

@@ -11,7 +11,7 @@ from slamcli.errors import SlamError
 from slamcli.schema import Grid
 
 COLOURS = {"occupied": "#1a1a1a", "free": "#ffffff", "unknown": "#c8c8c8"}
-TRAJECTORY, ROUTE, START, GOAL = "#0072b2", "#d55e00", "#009e73", "#cc79a7"
+TRAJECTORY, ROUTE, START, GOAL, BEGAN = "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#c23b22"
 LONGEST_SIDE = 11.0  # inches
 BAR_LENGTHS = np.array([0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0])  # [m]
 
@@ -40,8 +40,12 @@ def save_picture(path: Path, grid: Grid, *, trajectory: np.ndarray | None = None
 
 
 def draw(axis: Any, grid: Grid, *, trajectory: np.ndarray | None = None, route: np.ndarray | None = None, radius: float = 0.0,
-         title: str = "") -> None:  # fmt: skip
-    """Draw a grid into matplotlib axes, x to the right, y up."""
+         title: str = "", start: tuple[float, float, float] | None = None, font: float = 8.0) -> None:  # fmt: skip
+    """Draw a grid into matplotlib axes, x to the right, y up.
+
+    start : x [m], y [m], yaw [rad] where the recording began, drawn as an arrow
+    font : [pt] of the numbers and the legend
+    """
     from matplotlib.colors import ListedColormap
     from matplotlib.patches import Patch
 
@@ -54,14 +58,18 @@ def draw(axis: Any, grid: Grid, *, trajectory: np.ndarray | None = None, route: 
         handles += axis.plot(trajectory[:, 0], trajectory[:, 1], color=TRAJECTORY, lw=1.0, label="camera")
     if route is not None and len(route):
         handles += _draw_route(axis, route, radius)
+    if start is not None:
+        handles += _draw_start(axis, start, extent)
     axis.set_xlim(extent[:2])
     axis.set_ylim(extent[2:])
     axis.set_aspect("equal")
-    axis.set_xlabel("x [m]")
-    axis.set_ylabel("y [m]")
+    axis.set_xlabel("x [m]", fontsize=font)
+    axis.set_ylabel("y [m]", fontsize=font)
+    axis.tick_params(labelsize=font)
     axis.set_title(title, fontsize=10)
-    _scale_bar(axis, extent)
-    axis.legend(handles=handles, loc="upper center", bbox_to_anchor=(0.5, -0.08), ncols=len(handles), fontsize=8, frameon=False)
+    _scale_bar(axis, extent, font)
+    columns = len(handles) if font <= 8.0 else 4
+    axis.legend(handles=handles, loc="upper center", bbox_to_anchor=(0.5, -0.015 * font), ncols=columns, fontsize=font, frameon=False)
 
 
 def _extent(grid: Grid) -> tuple[float, float, float, float]:
@@ -84,10 +92,20 @@ def _draw_route(axis: Any, route: np.ndarray, radius: float) -> Sequence[Any]:
     return [*line, *ends]
 
 
-def _scale_bar(axis: Any, extent: tuple[float, float, float, float]) -> None:
+def _draw_start(axis: Any, start: tuple[float, float, float], extent: tuple[float, float, float, float]) -> Sequence[Any]:
+    """Draw where the recording began, and which way it looked."""
+    x, y, yaw = start
+    length = 0.07 * max(extent[1] - extent[0], extent[3] - extent[2])
+    axis.annotate(
+        "", (x + length * np.cos(yaw), y + length * np.sin(yaw)), (x, y), arrowprops={"color": BEGAN, "arrowstyle": "-|>", "lw": 2.0}
+    )
+    return axis.plot([x], [y], marker="o", ms=5, color=BEGAN, ls="none", label="recording began")
+
+
+def _scale_bar(axis: Any, extent: tuple[float, float, float, float], font: float) -> None:
     """Draw a bar of a round length, some fifth of the width, above the grid's left end, where it hides no cell."""
     width = extent[1] - extent[0]
     length = BAR_LENGTHS[np.argmin(np.abs(np.log(BAR_LENGTHS / (0.2 * width))))]
     above = axis.get_xaxis_transform()  # x in metres, y as a share of the axes' height
     axis.plot([extent[0], extent[0] + length], [1.02, 1.02], color="#000000", lw=3.0, solid_capstyle="butt", transform=above, clip_on=False)
-    axis.text(extent[0] + length, 1.02, f"  {length:g} m", fontsize=8, va="center", transform=above)
+    axis.text(extent[0] + length, 1.02, f"  {length:g} m", fontsize=font, va="center", transform=above)

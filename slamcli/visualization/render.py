@@ -12,6 +12,7 @@ from slamcli.errors import SlamError
 from slamcli.geometry import voxel
 from slamcli.geometry.octree import CENTRE, DEPTH, Octree, expand
 from slamcli.jit.kernel import kernel
+from slamcli.visualization import height_scale
 
 BACKGROUND = (232, 235, 240)  # off white, against which white walls show
 PATH_COLOUR = (214, 39, 40)
@@ -69,8 +70,10 @@ def draw_cloud(
     return _finish(image, z_buffer, eye, path)
 
 
-def draw_octree(tree: Octree, *, view: View, threshold: float = 0.0, path: np.ndarray | None = None) -> np.ndarray:
-    """Draw the occupied cells' faces on free space, coloured by height; returns (H, W, 3) uint8."""
+def draw_octree(
+    tree: Octree, *, view: View, threshold: float = 0.0, path: np.ndarray | None = None, with_scale: bool = False
+) -> np.ndarray:
+    """Draw the occupied cells' faces on free space, coloured by height, with a scale of it if wanted; returns (H, W, 3) uint8."""
     cell, faces = _visible_faces(tree, threshold)
     if not len(cell):
         raise SlamError("the octree has no occupied cell beside a free one: nothing to draw")
@@ -89,7 +92,17 @@ def draw_octree(tree: Octree, *, view: View, threshold: float = 0.0, path: np.nd
         triangles = np.concatenate([corners[:, [0, 1, 2]], corners[:, [0, 2, 3]]])
         colours = np.tile((colour * shade).astype(np.uint8), (2, 1))
         _fill_triangles(np.ascontiguousarray(triangles), colours, image, z_buffer)
-    return _finish(image, z_buffer, eye, path)
+    drawn = _finish(image, z_buffer, eye, path)
+    if not with_scale:
+        return drawn
+    low, high = _height_range(centre[:, 2])
+    return height_scale.add(drawn, _height_colours(np.linspace(low, high, 256), (low, high)), low=low, high=high)
+
+
+def octree_heights(tree: Octree) -> tuple[float, float]:
+    """Return the heights [m] that the lowest and the highest colour of `draw_octree` stand for."""
+    cell, _ = _visible_faces(tree, 0.0)
+    return _height_range((cell[:, 2] - CENTRE + 0.5) * tree.resolution)
 
 
 def draw_mesh(xyz: np.ndarray, triangle: np.ndarray, rgb: np.ndarray, *, view: View, path: np.ndarray | None = None) -> np.ndarray:
@@ -145,9 +158,15 @@ def _finish(image: np.ndarray, z_buffer: np.ndarray, eye: _Eye, path: np.ndarray
     return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
 
 
-def _height_colours(z: np.ndarray) -> np.ndarray:
-    """Colour heights from blue (low) over green to red (high), as octovis does."""
+def _height_range(z: np.ndarray) -> tuple[float, float]:
+    """Return the heights [m] that the ends of the colours stand for; single cells far off do not count."""
     low, high = np.quantile(z, [0.005, 0.995])
+    return round(float(low), 6) + 0.0, float(high)  # + 0.0: no -0.0
+
+
+def _height_colours(z: np.ndarray, between: tuple[float, float] | None = None) -> np.ndarray:
+    """Colour heights from blue (low) over green to red (high), as octovis does."""
+    low, high = between or _height_range(z)
     level = ((z - low) / max(high - low, 1e-6)).clip(0, 1) * 255
     return cv2.cvtColor(cv2.applyColorMap(level.astype(np.uint8).reshape(-1, 1), cv2.COLORMAP_TURBO), cv2.COLOR_BGR2RGB).reshape(-1, 3)
 

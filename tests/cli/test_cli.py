@@ -12,6 +12,7 @@ from pathlib import Path
 import click
 import fakes
 import pytest
+from click.shell_completion import ShellComplete
 from click.testing import Result
 
 import slamcli as package
@@ -379,3 +380,38 @@ def test_every_command_has_help(slamcli: Slamcli, path: tuple[str, ...]) -> None
 
 def test_each_stage_is_a_command() -> None:
     assert set(NAMES) <= set(cli.commands)
+
+
+def test_config_tells_what_is_changed_finds_by_word_and_speaks_json(fake: Path, slamcli: Slamcli) -> None:
+    slamcli("run", "recordings/desk", "-s", "track.min_inliers=20", "--until", "extract")
+    changed = slamcli("config", "--changed").stdout
+    assert changed.splitlines()[1:] == ["min_inliers = 20  # default: 15"]
+    assert slamcli("config", "--changed", "loop").stdout == "# nothing differs from the defaults\n"
+    assert "band_high" in slamcli("config", "--explain", "passable").stdout
+    assert json.loads(slamcli("config", "--json").stdout)["track"]["min_inliers"] == 20
+    unknown = slamcli("config", "--explain", "frobnicate")
+    assert (unknown.exit_code, unknown.stdout) == (1, "")
+
+
+def test_a_stage_takes_a_configuration_too(fake: Path, slamcli: Slamcli) -> None:
+    slamcli("run", "recordings/desk", "--until", "extract")
+    assert slamcli("extract", "--config", "fast").exit_code == 0
+    assert slamcli("config", "extract.features").stdout.splitlines()[-1] == "features = 600"
+
+
+def completed(*arguments: str, incomplete: str) -> list[str]:
+    found = ShellComplete(cli, {}, "slamcli", "_SLAMCLI_COMPLETE").get_completions(list(arguments), incomplete)
+    return [item.value for item in found]
+
+
+def test_recordings_runs_configurations_and_settings_are_completed(fake: Path, slamcli: Slamcli) -> None:
+    slamcli("run", "recordings/desk", "--until", "extract")
+    (fake / "data" / "tum" / "fr1_desk").mkdir(parents=True)
+    assert completed("run", incomplete="de") == ["demo"]
+    assert completed("run", incomplete="tum/") == ["tum/fr1_desk"]
+    assert completed("status", "-r", incomplete="runs/") == ["runs/desk", "runs/latest"]
+    assert completed("run", "--config", incomplete="f") == ["fast"]
+    assert completed("run", "-s", incomplete="track.min_") == ["track.min_inliers="]
+    assert completed("run", "-s", incomplete="match.method=") == ["match.method=words", "match.method=brute"]
+    assert completed("run", "-s", incomplete="loop.enabled=f") == ["loop.enabled=false"]
+    assert completed("run", "-s", incomplete="nothing.here=") == []

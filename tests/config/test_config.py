@@ -167,3 +167,35 @@ def test_explain_shows_unit_and_bounds_of_what_is_asked() -> None:
     assert "[extract]" not in text
     with pytest.raises(SlamError, match="did you mean"):
         toml.dump(Config(), only=["track.min_inlier"])
+
+
+@pytest.mark.parametrize(("name", "spec"), options(), ids=[name for name, _ in options()])
+def test_a_help_text_is_short_and_stands_alone(name: str, spec: dataclasses.Field) -> None:
+    words = spec.metadata["help"].split()
+    assert len(words) <= 15, f"{name}: {len(words)} words"
+    assert words[0] not in {"and", "or", "its", "such", "those", "unless", "then"}, f"{name} needs the option before it to be understood"
+
+
+def test_what_is_changed_is_told_with_its_default() -> None:
+    config = toml.apply(Config(), ["track.min_inliers=20", "seed=3", "camera.fx=500"])
+    assert toml.changed(config) == ["seed", "track.min_inliers", "camera"]
+    assert toml.changed(Config()) == []
+    text = toml.dump(config, only=toml.changed(config), with_defaults=True)
+    assert "seed = 3  # default: 0\n" in text
+    assert "min_inliers = 20  # default: 15\n" in text
+    assert "fx = 500.0" in text
+    assert toml.merge(Config(), toml.tomllib.loads(text), source="text") == config
+
+
+def test_options_are_found_by_a_word_of_their_name_or_help() -> None:
+    found = toml.find_options(["floor"])
+    assert "ground.min_patches" in found and "grid2d.extend_down" in found
+    assert "extract.levels" not in found
+    assert toml.find_options(["track", "seed", "octree.stride"]) == ["track", "seed", "octree.stride"]
+    with pytest.raises(SlamError, match="frobnicate is not known"):
+        toml.find_options(["frobnicate"])
+
+
+def test_explain_tells_what_fast_and_accurate_change() -> None:
+    text = toml.dump(Config(), explain=True, only=["extract.features"])
+    assert "accurate: 1500, fast: 600" in text

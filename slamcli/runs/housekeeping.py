@@ -1,0 +1,126 @@
+"""Run directories as things on a disk: which there are, what may be cleared away, and one file to take along."""
+
+import os
+import shutil
+import zipfile
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from slamcli.errors import SlamError
+from slamcli.runs.run_directory import LATEST, RUNS, RunDir
+from slamcli.stages import NAMES
+
+DEEPEST = 3  # folders below runs/ in which runs are looked for: runs/tum/fr1_room is the deepest that slamcli makes by itself
+INTERMEDIATE = ("extract", "match", "track", "optimize")  # what only later stages read; the results are in the stages after them
+EARLIEST = (1980, 1, 1, 0, 0, 0)  # of a zip file: no clock in it, so that the same run gives the same bytes
+
+
+@dataclass(frozen=True)
+class Listed:
+    """One run of a list."""
+
+    path: str
+    recording: str
+    stages: list[str]  # that are finished
+    frames: int | None
+    located: int | None
+    size: int  # bytes
+    is_latest: bool
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain values."""
+        return asdict(self)
+
+
+def list_runs(folder: Path = RUNS) -> list[Listed]:
+    """List the runs below a folder, by name; what is no readable run is passed over."""
+    latest = LATEST.resolve() if LATEST.exists() else None
+    found = []
+    for path in sorted(_run_folders(folder, DEEPEST)):
+        try:
+            run = RunDir.find(str(path))
+            found.append(_listed(run, is_latest=path.resolve() == latest))
+        except SlamError:
+            continue
+    return found
+
+
+def _run_folders(folder: Path, depth: int) -> Iterator[Path]:
+    for entry in folder.iterdir() if folder.is_dir() else ():
+        if not entry.is_dir() or entry.is_symlink():
+            continue
+        if (entry / "run.json").is_file():
+            yield entry
+        elif depth > 1:
+            yield from _run_folders(entry, depth - 1)
+
+
+def _listed(run: RunDir, *, is_latest: bool) -> Listed:
+    records = {stage: record for stage in NAMES if (record := run.record(stage)) is not None}
+    frames = next((record["summary"]["frames"] for record in records.values() if "frames" in record["summary"]), None)
+    loop = records["loop"]["summary"] if "loop" in records else {}
+    return Listed(
+        path=str(run.path),
+        recording=run.info()["dataset"],
+        stages=list(records),
+        frames=frames,
+        located=frames - loop["lost"] - loop.get("apart", 0) if frames is not None and "lost" in loop else None,
+        size=sum(file.stat().st_size for file in files_of(run)),
+        is_latest=is_latest,
+    )
+
+
+def files_of(run: RunDir) -> list[Path]:
+    """List a run's files; what a running stage is writing is left out."""
+    return sorted(
+        path
+        for path in run.path.rglob("*")
+        if path.is_file() and not any(part.startswith(".") for part in path.relative_to(run.path).parts)
+    )
+
+
+def clean(run: RunDir) -> dict[str, int]:
+    """Delete the stages that only later ones read, and return the bytes freed by stage; the run knows from then on that it was cleaned.
+
+    Raises SlamError where loop has not been run: nothing would be left of the run.
+    """
+    if run.record("loop") is None:
+        raise SlamError(f"{run.path}: loop has not been run, so there are no results to keep; finish it with: slamcli run {run.flag}")
+    freed = {}
+    with run.lock():
+        for stage in INTERMEDIATE:
+            folder = run.path / stage
+            if folder.is_dir():
+                freed[stage] = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
+                gone = run.path / f".{stage}.old"
+                folder.rename(gone)  # at once: a stage is complete or absent, whatever happens
+                run.mark_cleaned(stage)
+                shutil.rmtree(gone)
+    return freed
+
+
+def archive(run: RunDir, out: Path, *, skip: Sequence[str] = ()) -> int:
+    """Write a run's files to the zip file `out`, all or none; returns how many they are. The same run gives the same bytes.
+
+    skip : stages that are left out
+    """
+    if out.resolve().is_relative_to(run.path.resolve()):
+        raise SlamError(f"{out}: lies in the run that is to be packed; choose another place")
+    chosen = [path for path in files_of(run) if path.relative_to(run.path).parts[0] not in skip]
+    fresh = out.with_name(f".{out.name}.{os.getpid()}")
+    try:
+        with zipfile.ZipFile(fresh, "w", compression=zipfile.ZIP_DEFLATED) as packed:
+            for path in chosen:
+                entry = zipfile.ZipInfo(f"{run.path.resolve().name}/{path.relative_to(run.path).as_posix()}", date_time=EARLIEST)
+                entry.compress_type = zipfile.ZIP_DEFLATED
+                entry.external_attr = 0o644 << 16
+                with path.open("rb") as source, packed.open(entry, "w", force_zip64=True) as target:
+                    shutil.copyfileobj(source, target, 1 << 20)
+        os.replace(fresh, out)
+    except OSError as error:
+        raise SlamError(f"{out}: cannot be written ({error.strerror}); choose another place") from error
+    finally:
+        fresh.unlink(missing_ok=True)
+    return len(chosen)
