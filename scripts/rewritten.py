@@ -35,7 +35,7 @@ def listed(source: str | Path) -> Listed:
     """Read the lists of a recording in the TUM layout."""
     dataset = open_dataset(str(source))
     colour, depth = (read_list(dataset.root / f"{name}.txt") for name in ("rgb", "depth"))
-    pairs = (list(zip(found.stamp.tolist(), found.name, strict=True)) for found in (colour, depth))
+    pairs = (list(zip(found.stamp.tolist(), found.names, strict=True)) for found in (colour, depth))
     return Listed(dataset, *pairs, dataset.ground_truth())
 
 
