@@ -3,15 +3,17 @@
 
     python scripts/bench.py                                    what each stage of the last run cost, from its records
     python scripts/bench.py -r runs/tum/fr1_xyz
-    python scripts/bench.py RECORDING... [--orbslam3 ORB/bin/python words.txt] [--open3d]
-                            [--json figures.json] [--readme README.md]
+    python scripts/bench.py RECORDING... [--png] [--rounds 3] [--orbslam3 ORB/bin/python words.txt] [--open3d]
+                            [--json figures.json] [--readme README.md] [--flame graph.svg]
 
 With recordings, every stage runs anew in a process of its own, the others track the same images after it, and tables follow, in
 Markdown: time, in all and by stage (Table 3 of Zhao et al. 2020), APE (their Table 4) and map sizes (their Table 5). What others published is marked so.
 CPU time is of all threads, files included, per colour frame; compiling kernels, which happens once per machine, is no part of it.
 Machines differ: "of plain ORB" tells it as a multiple of what cv2.ORB_create(1000).detectAndCompute needs for the same images in the same
 session. --compare FILE warns where that multiple has grown by more than a tenth since FILE, the --json of an earlier session, was written;
---readme puts the tables between the marks in that file. ORB-SLAM3 needs an environment of its own, see orbslam3.py.
+--readme puts the tables between the marks in that file. Each recording's ledger follows, see ledger.py: medians over --rounds; with --png
+also of the recording with its colour rewritten as PNG, which costs more to decode than JPEG does. --flame draws a flame graph.
+ORB-SLAM3 needs an environment of its own, see orbslam3.py.
 """
 
 import argparse
@@ -21,9 +23,11 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import cv2
+import ledger
 import own_process
 import published
 import rivals
@@ -88,21 +92,34 @@ def cpu_ms(records: list[dict[str, Any]], n_frames: int) -> float:
 
 
 def measure(recording: str, given: argparse.Namespace, folder: Path) -> dict[str, Any]:
-    """Run everything on a recording and give its figures."""
+    """Run everything on a recording, as often as asked for, and give its figures: the medians of times, all else of the last round."""
+    rounds = [one_round(recording, given, folder / str(k)) for k in range(given.rounds)]
+    found = rounds[-1]
+    found["plain_orb_ms"] = median(one["plain_orb_ms"] for one in rounds)
+    for system, figures in found["systems"].items():
+        for name in ("cpu_ms", "cpu_with_decoding_ms", "wall_seconds"):
+            if name in figures:
+                figures[name] = median(one["systems"][system][name] for one in rounds)
+        figures["of_plain_orb"] = figures["cpu_ms"] / found["plain_orb_ms"]
+    mine = found["systems"][OURS]
+    mine["costs"] = ledger.middle([one["systems"][OURS]["costs"] for one in rounds])
+    mine["stages"] = {stage: figures["cpu_ms"] for stage, figures in mine["costs"].items()}
+    return found
+
+
+def one_round(recording: str, given: argparse.Namespace, folder: Path) -> dict[str, Any]:
+    """Run everything on a recording once."""
     run = own_process.run(recording, path=folder).directory
-    yardstick = plain_orb_ms(run)
     systems = {OURS: ours(run)}
     if given.orbslam3:
         systems["ORB-SLAM3"] = rivals.orbslam3(run, *given.orbslam3)
     if given.open3d:
         systems["Open3D SLAM"] = rivals.open3d(run)
-    for figures in systems.values():
-        figures["of_plain_orb"] = figures["cpu_ms"] / yardstick
     return {
         "recording": run.info()["dataset"],
         "is_simulated": (run.dataset().root / "scene.json").is_file(),
         "frames": rivals.n_frames(run),
-        "plain_orb_ms": yardstick,
+        "plain_orb_ms": plain_orb_ms(run),
         "systems": systems,
         "bytes": {name: run.stage_path(*place).stat().st_size for name, place in MAP_FILES.items()},
     }
@@ -122,7 +139,7 @@ def ours(run: RunDir) -> dict[str, Any]:
     n_frames = records[0]["summary"]["frames"]
     figures = {
         "cpu_ms": cpu_ms(records, n_frames),
-        "stages": {record["stage"]: cpu_ms([record], n_frames) for record in records},
+        "costs": ledger.stage_costs(records, n_frames),
         "wall_seconds": sum(record["seconds"] - record["compile_seconds"] for record in records),
         "peak_mib": max(record["peak_rss_mb"] for record in records),
     }
@@ -149,6 +166,16 @@ def plain_orb_ms(run: RunDir) -> float:
 def tables(found: list[dict[str, Any]]) -> str:
     """Render all tables in Markdown."""
     return "\n\n".join([time_table(found), stage_table(found), ape_table(found), size_table(found)])
+
+
+def ledgers(found: list[dict[str, Any]]) -> str:
+    """Where our time goes, stage by stage: CPU and wall time, the share of two cores, multiples of others in the same session."""
+    blocks = []
+    for figures in found:
+        rival = figures["systems"].get("ORB-SLAM3", {}).get("cpu_with_decoding_ms")
+        rows = ledger.rows(figures["systems"][OURS]["costs"], plain_orb_ms=figures["plain_orb_ms"], orbslam3_ms=rival)
+        blocks.append(markdown([[f"{name_of(figures)}, {figures['frames']} frames", *ledger.HEADINGS], *rows]))
+    return "\n\n".join(blocks)
 
 
 def name_of(figures: dict[str, Any]) -> str:
@@ -233,6 +260,12 @@ def slower(found: list[dict[str, Any]], baseline: list[dict[str, Any]]) -> list[
     return told
 
 
+def recordings(given: argparse.Namespace, folder: Path) -> list[str]:
+    """List the recordings to measure: those named, and with --png each of them once more as PNG."""
+    more = [str(ledger.as_png(name, folder / f"{Path(name).name}_png")) for name in given.recordings] if given.png else []
+    return [*given.recordings, *more]
+
+
 def main() -> None:
     """Read the arguments and show what they ask for."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -240,6 +273,9 @@ def main() -> None:
     parser.add_argument("-r", "--run", help="show the records of this run; without recordings")
     parser.add_argument("--orbslam3", nargs=2, metavar=("PYTHON", "WORDS"))
     parser.add_argument("--open3d", action="store_true", help="Open3D's dense RGB-D SLAM beside it")
+    parser.add_argument("--png", action="store_true", help="each recording also with its colour images rewritten as PNG")
+    parser.add_argument("--rounds", type=int, default=1, help="how often; times are medians [1]")
+    parser.add_argument("--flame", type=Path, metavar="FILE", help="draw a flame graph of the first recording, SVG; needs py-spy")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures")
     parser.add_argument("--readme", type=Path, metavar="FILE", help="put the tables into this file")
     parser.add_argument("--compare", type=Path, metavar="FILE", help="figures of an earlier session")
@@ -249,10 +285,14 @@ def main() -> None:
             show(RunDir.find(given.run))
             return
         with tempfile.TemporaryDirectory() as folder:
-            found = [measure(recording, given, Path(folder) / str(k)) for k, recording in enumerate(given.recordings)]
+            found = [
+                measure(recording, given, Path(folder) / "runs" / str(k)) for k, recording in enumerate(recordings(given, Path(folder)))
+            ]
+            if given.flame:
+                ledger.flame(given.recordings[0], given.flame, Path(folder) / "flame")
         if given.json:
             given.json.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
-        print(tables(found))
+        print(f"{tables(found)}\n\n{ledgers(found)}")
         if given.readme:
             put_into(given.readme, tables(found))
         if given.compare:

@@ -20,6 +20,7 @@ class Run:
     def __init__(self, scene, folder, *, given=CAMERA, optimize=None, **loop_settings):
         self.scene, self.folder, self.given, self.warnings = scene, folder, given, []
         optimize = optimize or OptimizeConfig()
+        self.workers = 2
         self.cfg = SimpleNamespace(track=TrackConfig(), sensor=SENSOR, optimize=optimize, loop=LoopConfig(**loop_settings))
         self.depth = CoarseDepth(np.zeros((len(scene.features.stamp), 0, 0), np.uint16))
         self.warn, self.summary = self.warnings.append, {}

@@ -20,6 +20,7 @@ MAGIC = b"\x89PNG\r\n\x1a\n"
 HEADER = struct.Struct(
     ">4x4sIIBBBBB"
 )  # of the chunk IHDR: its length, name, width, height, bits, colour type, compression, filter, interlacing
+CHUNK, CHECKSUM = struct.Struct(">I4s"), struct.Struct(">I")  # the length and name before a chunk, and what follows it
 GREY_16, RGB_8 = (16, 0), (8, 2)  # (bits, colour type)
 BYTES_PER_PIXEL = {GREY_16: 2, RGB_8: 3}
 # Chunks that say nothing about what OpenCV makes of the pixels. All others, transparency and animation among them, are for OpenCV.
@@ -90,9 +91,9 @@ def _parts(data: bytes, size: tuple[int, int], kind: tuple[int, int]) -> list[me
     parts: list[memoryview] = []
     view, at, last = memoryview(data), len(MAGIC), b""
     while at + 12 <= len(data):
-        (n,), name = struct.unpack_from(">I", data, at), data[at + 4 : at + 8]
+        n, name = CHUNK.unpack_from(data, at)
         end = at + 8 + n
-        if end + 4 > len(data) or _zlib.crc32(view[at + 4 : end]) != int.from_bytes(data[end : end + 4], "big"):
+        if end + 4 > len(data) or _zlib.crc32(view[at + 4 : end]) != CHECKSUM.unpack_from(data, end)[0]:
             return None
         if name == b"IDAT":
             if parts and last != b"IDAT":  # they must follow on one another

@@ -1,7 +1,7 @@
 """What a depth image says at key points: how far away, how slanted, and whether an outline hides the surface there."""
 
 import numpy as np
-from numba import f4, f8, i8
+from numba import b1, f4, f8, i8
 
 from slamcli.jit.kernel import kernel
 
@@ -9,6 +9,7 @@ USUAL_WIDTH = 640  # px
 JUMP_REACH = 3  # px to either side of a key point where a jump of depth is looked for: as far as FAST looks
 SLOPE_REACH = 8  # px to either side of a key point from which the slope of its surface is read
 SLOPE_STEP = 2  # px between the pixels looked at: neighbours share most of their noise
+ONE, TWO = np.float32(1.0), np.float32(2.0)
 LEVEL = 0.1  # px^2, of some 1000: how strongly a direction is believed to be level where no pair says otherwise
 SLOPE_BEND = 0.03  # share by which inverse depth may bend over a pair of pixels that still shows one surface
 
@@ -37,17 +38,27 @@ def is_behind_outline(depth: np.ndarray, xy: np.ndarray, *, jump: float) -> np.n
     Along a line over a plane, however slanted, the inverse of depth is linear in pixels: beside something nearer it bends up. In an image
     less than 640 pixels wide as many pixels span a wider angle, and each fold of a surface bends more: `jump` grows in proportion.
     """
-    column, row = np.rint(xy).astype(np.int64).T
+    is_behind, least = np.empty(len(xy), dtype=np.bool_), jump * _coarseness(depth)
+    at = np.rint(xy).astype(np.int64)
+    _is_behind_outline(np.ascontiguousarray(depth, dtype=np.float32), at, JUMP_REACH, np.float32(least), is_behind)
+    return is_behind
 
-    def inverse(down: int, right: int) -> np.ndarray:
-        rows = np.clip(row + JUMP_REACH * down, 0, depth.shape[0] - 1)
-        return 1.0 / depth[rows, np.clip(column + JUMP_REACH * right, 0, depth.shape[1] - 1)]
 
-    least = jump * _coarseness(depth)
-    here, found = inverse(0, 0), np.zeros(len(xy), dtype=bool)
-    for down, right in ((0, 1), (1, 0), (1, 1), (1, -1)):
-        found |= inverse(down, right) + inverse(-down, -right) - 2.0 * here > least * here
-    return found
+@kernel(error_model="numpy")
+def _is_behind_outline(depth: f4[:, ::1], at: i8[:, ::1], reach: i8, least: f4, is_behind: b1[::1]) -> None:
+    height, width = depth.shape
+    for n in range(len(at)):
+        column, row = at[n, 0], at[n, 1]
+        up, down = max(row - reach, 0), min(row + reach, height - 1)
+        left, right = max(column - reach, 0), min(column + reach, width - 1)
+        here = ONE / depth[row, column]
+        limit, both = least * here, TWO * here
+        is_behind[n] = (
+            (ONE / depth[row, right] + ONE / depth[row, left]) - both > limit
+            or (ONE / depth[down, column] + ONE / depth[up, column]) - both > limit
+            or (ONE / depth[down, right] + ONE / depth[up, left]) - both > limit
+            or (ONE / depth[down, left] + ONE / depth[up, right]) - both > limit
+        )
 
 
 def inverse_depth_slope(depth: np.ndarray, xy: np.ndarray) -> np.ndarray:

@@ -257,11 +257,9 @@ def _measurements(seen: Observations, is_finite_landmark: np.ndarray) -> np.ndar
     with np.errstate(divide="ignore", invalid="ignore"):
         inv_px, inv_z = 1.0 / np.asarray(seen.sigma_px, dtype=np.float64), 1.0 / np.asarray(seen.sigma_z, dtype=np.float64)
     xy, depth = np.asarray(seen.xy, dtype=np.float64).reshape(-1, 2), np.asarray(seen.depth, dtype=np.float64)
-    is_valid = np.isfinite(xy).all(axis=1) & np.isfinite(inv_px) & is_finite_landmark
+    is_valid = np.isfinite(xy[:, 0]) & np.isfinite(xy[:, 1]) & np.isfinite(inv_px) & is_finite_landmark
     has_depth = is_valid & np.isfinite(depth) & np.isfinite(inv_z)
-    measured = np.zeros((len(xy), 5))
-    measured[is_valid, :2] = xy[is_valid]
-    measured[has_depth, 2] = depth[has_depth]
-    measured[is_valid, 3] = inv_px[is_valid]
-    measured[has_depth, 4] = inv_z[has_depth]
+    measured, columns = np.empty((len(xy), 5)), (xy[:, 0], xy[:, 1], depth, inv_px, inv_z)
+    for k, (column, is_given) in enumerate(zip(columns, (is_valid, is_valid, has_depth, is_valid, has_depth), strict=True)):
+        measured[:, k] = np.where(is_given, column, 0.0)
     return measured

@@ -68,7 +68,7 @@ def linearize(
     """Add up the blocks of the normal equations with Huber's weights, in arrays that hold 0 before.
 
     U (n, 6, 6) and b_c (n, 6) of the free key frames, V (L, 3, 3) and b_l (L, 3) of the landmarks, upper triangles alone;
-    W (O, 3, 6) = J_landmark^T w J_pose. b is minus the gradient.
+    W (O, 3, 6) = J_landmark^T w J_pose, written for free key frames alone. b is minus the gradient.
 
     With r = prediction - measurement, each residual's derivative by the point in the camera, scaled by 1 / sigma,
         u: g = (fx/Z, 0, -fx X/Z^2)    v: g = (0, fy/Z, -fy Y/Z^2)    z: g = (0, 0, 1)
@@ -86,7 +86,7 @@ def linearize(
             y = R[1, 0] * px + R[1, 1] * py + R[1, 2] * pz + R[1, 3]
             z = R[2, 0] * px + R[2, 1] * py + R[2, 2] * pz + R[2, 3]
             if not (inv_px > 0.0 and z > Z_MIN):
-                for i in range(3):
+                for i in range(3 if f >= 0 else 0):
                     for j in range(6):
                         W[o, i, j] = 0.0
                 continue
@@ -104,8 +104,9 @@ def linearize(
                 b_l[lm, j] -= r0 * q0 + r1 * q1 + r2 * q2
                 for i in range(j + 1):
                     V[lm, i, j] += R[0, i] * p0 + R[1, i] * p1 + R[2, i] * p2
-                row = W[o, j]
-                row[0], row[1], row[2], row[3], row[4], row[5] = p0, p1, p2, y * p2 - z * p1, z * p0 - x * p2, x * p1 - y * p0
+                if f >= 0:
+                    row = W[o, j]
+                    row[0], row[1], row[2], row[3], row[4], row[5] = p0, p1, p2, y * p2 - z * p1, z * p0 - x * p2, x * p1 - y * p0
             if f < 0:
                 continue
             u, g = U[f], b_c[f]

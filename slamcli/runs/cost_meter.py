@@ -1,5 +1,7 @@
 """What a stage costs: wall and CPU time, peak memory, and the time numba spent compiling."""
 
+import contextlib
+import ctypes
 import os
 import resource
 import sys
@@ -56,6 +58,12 @@ class Meter:
             if self._done.wait(SAMPLING):
                 self.peak_rss_mb = max(self.peak_rss_mb, _resident_mb())
                 return
+
+
+def return_free_memory() -> None:
+    """Hand what the stages before have freed back to the system, where the C library can: else it would count as the next stage's too."""
+    with contextlib.suppress(OSError, AttributeError):  # a C library other than glibc
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 def _resident_mb() -> float:

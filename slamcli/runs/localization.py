@@ -94,5 +94,7 @@ def _refine(builder, features, tracks: Tracks, when: Timing, map_: Map, camera, 
     for _ in range(LOOKS):
         moving = replace(when, twist=rolling_shutter.frame_twists(features.stamp, tracks, map_))
         rectified = rolling_shutter.rectify(features, moving, camera)
-        tracks = final_refinement.refine_frames(builder, rectified, tracks, camera, config.sensor, config.track, progress)
+        tracks = final_refinement.refine_frames(
+            builder, rectified, tracks, camera, config.sensor, config.track, progress, workers=config.run.workers
+        )
     return tracks

@@ -18,7 +18,7 @@ from slamcli.errors import SlamError
 from slamcli.jit import compilation
 from slamcli.parallel import one_thread_in_blas
 from slamcli.runs import run_directory, source_code, staleness
-from slamcli.runs.cost_meter import Meter
+from slamcli.runs.cost_meter import Meter, return_free_memory
 from slamcli.runs.run_directory import RunDir
 from slamcli.runs.staleness import State
 from slamcli.schema import FORMAT
@@ -223,6 +223,7 @@ class Pipeline:
             self.run.commit(stage.name, out, record)
         log.debug("%s", record)
         self._tell(stage_line(record))
+        return_free_memory()
 
     def _present_input(self, name: str) -> str:
         if name in NAMES:

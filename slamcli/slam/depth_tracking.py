@@ -2,6 +2,8 @@
 
 from collections import OrderedDict
 from dataclasses import dataclass
+from itertools import chain
+from threading import Lock
 
 import numpy as np
 
@@ -10,6 +12,7 @@ from slamcli.depth import icp
 from slamcli.depth.icp import Alignment, Relief
 from slamcli.geometry import se3
 from slamcli.geometry.camera import Camera
+from slamcli.parallel import ordered_map
 from slamcli.schema import CoarseDepth
 from slamcli.sparse_map.sparse_map import MapBuilder
 
@@ -24,12 +27,13 @@ JOIN_MOST = 5  # edges of a new key frame to earlier ones: more of them hold dow
 
 
 class Reliefs:
-    """The reliefs of a recording's frames; those used last are kept."""
+    """The reliefs of a recording's frames; those used last are kept. Several threads may ask at once."""
 
     def __init__(self, depth: CoarseDepth, given: Camera, sensor: SensorConfig, *, camera: Camera | None = None) -> None:
         """Take the coarse depth images, read under the calibration `given`; camera : what is known of the camera, if more."""
         self._depth, self._given, self._camera, self._sensor = depth, given, camera or given, sensor
         self._kept: OrderedDict[int, Relief | None] = OrderedDict()
+        self._lock = Lock()
 
     def under(self, camera: Camera) -> "Reliefs":
         """Give the reliefs as they are under another calibration of the same camera."""
@@ -37,12 +41,15 @@ class Reliefs:
 
     def of(self, frame: int) -> Relief | None:
         """Give the relief of a frame, None where it shows too little."""
-        if frame in self._kept:
-            self._kept.move_to_end(frame)
-            return self._kept[frame]
-        self._kept[frame] = found = self._make(frame)
-        if len(self._kept) > KEPT:
-            self._kept.popitem(last=False)
+        with self._lock:
+            if frame in self._kept:
+                self._kept.move_to_end(frame)
+                return self._kept[frame]
+        found = self._make(frame)  # by two threads at once at worst: both find the same
+        with self._lock:
+            self._kept[frame] = found
+            if len(self._kept) > KEPT:
+                self._kept.popitem(last=False)
         return found
 
     def _make(self, frame: int) -> Relief | None:
@@ -142,32 +149,42 @@ class Shape:
                 break
         return n
 
-    def join_covisible(self, T_cd: np.ndarray, *, most: int, least: int) -> int:
+    def join_covisible(self, T_cd: np.ndarray, *, most: int, least: int, workers: int = 1) -> int:
         """Add edges between each key frame and up to `most` earlier ones that share at least `least` landmarks; returns how many.
 
-        T_cd : (K, 4, 4) each key frame's camera when its depth was measured, to its camera when colour was
+        T_cd : (K, 4, 4) each key frame's camera when its depth was measured, to its camera when colour was; workers : threads
         """
-        n = 0
         joined = set(map(tuple, self._builder.edge.kf.tolist()))
-        for kf in range(1, len(self._builder.kf)):
+
+        def edges(kf: int) -> list[tuple | None]:
             neighbours, shared = self._builder.covisible(kf)
-            for other in neighbours[(neighbours < kf) & (shared >= least)][:most].tolist():
-                n += (kf, other) not in joined and self.join_pair(kf, other, T_cd)
-        return n
+            others = neighbours[(neighbours < kf) & (shared >= least)][:most].tolist()
+            return [self._edge(kf, other, T_cd) for other in others if (kf, other) not in joined]
+
+        found = chain.from_iterable(ordered_map(edges, range(1, len(self._builder.kf)), workers=workers))
+        return sum(self._add(edge) for edge in list(found))
 
     def join_pair(self, kf_i: int, kf_j: int, T_cd: np.ndarray | None = None) -> bool:
         """Add an edge between two key frames if their depth images show the same and determine how the two lie."""
+        return self._add(self._edge(kf_i, kf_j, T_cd))
+
+    def _edge(self, kf_i: int, kf_j: int, T_cd: np.ndarray | None) -> tuple[int, int, np.ndarray, np.ndarray] | None:
+        """Find the edge between two key frames, as `MapBuilder.add_edge` takes it; None where their depth images determine none."""
         table = self._builder.kf
         T_i, T_j = (np.eye(4) if T_cd is None else T_cd[kf] for kf in (kf_i, kf_j))
         target, source = (self._map_reliefs.of(int(table.frame[kf])) for kf in (kf_i, kf_j))
         if target is None or source is None:
-            return False
+            return None
         found = icp.align(se3.inverse(table.T_wk[kf_i] @ T_i) @ table.T_wk[kf_j] @ T_j, source, target)
         if found.agreement < MIN_AGREEMENT or found.overlap < JOIN_OVERLAP or icp.n_determined(found.information, found.depth) < 6:
-            return False
+            return None
         to_depth = se3.adjoint(se3.inverse(T_i))
-        self._builder.add_edge(kf_i, kf_j, T_i @ found.T_ij @ se3.inverse(T_j), to_depth.T @ found.information @ to_depth)
-        return True
+        return kf_i, kf_j, T_i @ found.T_ij @ se3.inverse(T_j), to_depth.T @ found.information @ to_depth
+
+    def _add(self, edge: tuple[int, int, np.ndarray, np.ndarray] | None) -> bool:
+        if edge is not None:
+            self._builder.add_edge(*edge)
+        return edge is not None
 
     def around(self, T_wc: np.ndarray, segment: int) -> np.ndarray:
         """Give the key frames of a segment that stand and look nearly as a camera at T_wc does, nearest first."""

@@ -1,6 +1,7 @@
 """The second look: key frames by their depth images, then every frame by landmarks, meet the final map again. Only a batch program can."""
 
 from dataclasses import replace
+from itertools import chain
 
 import numpy as np
 
@@ -8,8 +9,10 @@ from slamcli.calibration import rolling_shutter
 from slamcli.calibration.self_calibration import Sensing
 from slamcli.config.options import SensorConfig, TrackConfig
 from slamcli.estimation.bundle_adjustment import BundleResult
+from slamcli.estimation.camera_pose import PoseEstimate
 from slamcli.geometry import se3
 from slamcli.geometry.camera import Camera
+from slamcli.parallel import ordered_map
 from slamcli.schema import KEY_FRAME, LOST, ON_SHAPE, RELOCALISED, Features, Tracks
 from slamcli.slam.depth_tracking import Reliefs, Shape
 from slamcli.sparse_map import guided_matching, map_adjustment
@@ -33,20 +36,22 @@ def look_again(
     shape_weight: float = 1.0,
     iterations: int,
     progress,
+    workers: int = 1,
 ) -> tuple[Tracks, BundleResult | None]:
     """Align each key frame's depth image with those of up to `shape_edges` covisible ones, adjust the map, refine every frame against it.
 
     builder : its map is changed; its features are those that `sensing` corrected
     reliefs : of the recording, of which depth images are taken; shape_weight : factor on what they say in the adjustment
+    workers : threads; the result is the same with any number
     Returns the refined tracks, and the evidence of the adjustment, None where nothing ties two key frames together.
     """
     if shape_edges:
         T_cd = rolling_shutter.depth_to_colour(builder.features, sensing.timing, builder.kf.frame)
         reliefs = reliefs.under(sensing.camera)
-        Shape(builder, reliefs, reliefs).join_covisible(T_cd, most=shape_edges, least=SHARED)
+        Shape(builder, reliefs, reliefs).join_covisible(T_cd, most=shape_edges, least=SHARED, workers=workers)
     kfs = np.arange(len(builder.kf), dtype=np.int32)
     result = map_adjustment.adjust(builder, kfs, sensing.camera, sensor, max_iterations=iterations, edge_weight=shape_weight)
-    tracks = refine_frames(builder, builder.features, tracks, sensing.camera, sensor, settings, progress)
+    tracks = refine_frames(builder, builder.features, tracks, sensing.camera, sensor, settings, progress, workers=workers)
     return move_key_frames(builder, tracks), result
 
 
@@ -73,25 +78,38 @@ def move_key_frames(builder: MapBuilder, tracks: Tracks) -> Tracks:
 
 
 def refine_frames(
-    builder: MapBuilder, features: Features, tracks: Tracks, camera: Camera, sensor: SensorConfig, settings: TrackConfig, progress
+    builder: MapBuilder,
+    features: Features,
+    tracks: Tracks,
+    camera: Camera,
+    sensor: SensorConfig,
+    settings: TrackConfig,
+    progress,
+    *,
+    workers: int = 1,
 ) -> Tracks:
     """Refine every frame against the landmarks around it; lost ones are tried from both sides.
 
-    features, tracks : of the frames, which may be of another recording than the map
+    features, tracks : of the frames, which may be of another recording than the map; workers : threads
     A frame keeps its pose where much fewer landmarks agree than before, and a key frame also where so few do that shape held it.
     Returns new Tracks; the map stays as it is.
     """
     look = _Look(builder, features, tracks, camera, sensor, settings)
     n = len(tracks.state)
-    for i in progress(range(n), "hindsight"):
-        if tracks.state[i] not in (LOST, ON_SHAPE):  # the few landmarks around a frame on shape would make its pose worse
-            look.at(i, look.T_wc[i], int(tracks.ref_kf[i]), least=settings.shape_below if tracks.state[i] == KEY_FRAME else 0)
+    # The few landmarks around a frame on shape would make its pose worse.
+    chosen = np.flatnonzero((tracks.state != LOST) & (tracks.state != ON_SHAPE))
+    # No frame depends on another; those that follow one another on one key frame share the landmarks around it.
+    spans = np.split(chosen, np.flatnonzero(np.diff(tracks.ref_kf[chosen])) + 1)
+    refined = ordered_map(look.again, spans, workers=workers)
+    for i, estimate in progress(chain.from_iterable(refined), "hindsight", len(chosen)):
+        if estimate is not None:
+            look.record(i, int(tracks.ref_kf[i]), estimate)
     for order, step in ((range(n), -1), (range(n - 1, -1, -1), 1)):
         for i in order:  # a lost frame begins where its neighbour in time stands
             j = i + step
             is_open = look.state[i] == LOST and 0 <= j < n and look.ref_kf[j] >= 0
-            if is_open and look.at(i, look.T_wc[j], int(look.ref_kf[j]), widening=LOST_WIDENING):
-                look.at(i, look.T_wc[i], int(look.ref_kf[i]))
+            if is_open and look.place(i, look.T_wc[j], int(look.ref_kf[j]), widening=LOST_WIDENING):
+                look.place(i, look.T_wc[i], int(look.ref_kf[i]))
                 look.state[i] = RELOCALISED
     return Tracks(ref_kf=look.ref_kf, T_kc=look.T_kc, state=look.state, n_inliers=look.n_inliers)
 
@@ -108,18 +126,42 @@ class _Look:
         self.T_wc[has_pose] = builder.kf.T_wk[tracks.ref_kf[has_pose]] @ tracks.T_kc[has_pose]
         self.ref_kf, self.T_kc = tracks.ref_kf.copy(), tracks.T_kc.copy()
         self.state, self.n_inliers = tracks.state.copy(), tracks.n_inliers.copy()
-        self._around: dict[int, guided_matching.Candidates] = {}
 
-    def at(self, i: int, T_wc: np.ndarray, kf: int, *, widening: float = 1.0, least: int = 0) -> bool:
+    def again(self, span: np.ndarray) -> list[tuple[int, PoseEstimate | None]]:
+        """Look for frames that stand on one key frame where they stand; returns each with its pose, None if it is not there."""
+        if len(span) == 0:
+            return []
+        landmarks, found = self._landmarks_around(int(self.ref_kf[span[0]])), []
+        for i in span.tolist():
+            least = self.settings.shape_below if self.state[i] == KEY_FRAME else 0
+            found.append((i, self._find(i, self.T_wc[i], landmarks, least=least)))
+        return found
+
+    def place(self, i: int, T_wc: np.ndarray, kf: int, *, widening: float = 1.0) -> bool:
         """Look for frame `i` at `T_wc` among the landmarks around key frame `kf`; False, and nothing changes, if it is not there.
 
-        widening : of the search window, where `T_wc` is a guess; least : landmarks that must agree whatever the settings say
+        widening : of the search window, where `T_wc` is a guess
         """
+        estimate = self._find(i, T_wc, self._landmarks_around(kf), widening=widening)
+        if estimate is not None:
+            self.record(i, kf, estimate)
+        return estimate is not None
+
+    def record(self, i: int, kf: int, estimate: PoseEstimate) -> None:
+        """Note where frame `i` was found, relative to key frame `kf`."""
+        self.ref_kf[i], self.n_inliers[i] = kf, estimate.n_inliers
+        self.T_wc[i] = se3.inverse(estimate.T_cw)
+        self.T_kc[i] = se3.inverse(estimate.T_cw @ self.builder.kf.T_wk[kf])
+
+    def _find(
+        self, i: int, T_wc: np.ndarray, landmarks: guided_matching.Candidates, *, widening: float = 1.0, least: int = 0
+    ) -> PoseEstimate | None:
+        """Estimate the pose of frame `i` from a guess; None where fewer landmarks agree than the settings, half of before, or `least` say."""
         wanted = max(least, self.settings.min_inliers, int(self.n_inliers[i]) // 2)
-        frame, candidates = frame_features(self.features, i, self.camera, self.sensor), self._landmarks_around(kf)
+        frame, T_cw = frame_features(self.features, i, self.camera, self.sensor), se3.inverse(T_wc)
         feature, _ = guided_matching.search(
-            se3.inverse(T_wc),
-            candidates,
+            T_cw,
+            landmarks,
             frame,
             self.camera,
             octave_scale=self.builder.octave_scale,
@@ -129,18 +171,10 @@ class _Look:
         )
         which = np.flatnonzero(feature >= 0)
         if len(which) < wanted:
-            return False
-        estimate = refine_on_landmarks(se3.inverse(T_wc), candidates.xyz[which], frame, feature[which], self.camera)
-        if estimate.n_inliers < wanted:
-            return False
-        self.ref_kf[i], self.n_inliers[i] = kf, estimate.n_inliers
-        self.T_wc[i] = se3.inverse(estimate.T_cw)
-        self.T_kc[i] = se3.inverse(estimate.T_cw @ self.builder.kf.T_wk[kf])
-        return True
+            return None
+        estimate = refine_on_landmarks(T_cw, landmarks.xyz[which], frame, feature[which], self.camera)
+        return estimate if estimate.n_inliers >= wanted else None
 
     def _landmarks_around(self, kf: int) -> guided_matching.Candidates:
-        if kf not in self._around:
-            neighbours, _ = self.builder.covisible(kf)
-            ids = self.builder.landmarks_in(np.append(neighbours[:NEIGHBOURS], kf))
-            self._around = {kf: self.builder.candidates(ids)}  # frames come in order: the last one is enough
-        return self._around[kf]
+        neighbours, _ = self.builder.covisible(kf)
+        return self.builder.candidates(self.builder.landmarks_in(np.append(neighbours[:NEIGHBOURS], kf)))

@@ -49,6 +49,7 @@ def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
             shape_weight=cfg.loop.shape_weight,
             iterations=cfg.loop.iterations,
             progress=tools.progress,
+            workers=tools.workers,
         )
     map_ = map_segments.anchored(main_first(builder.snapshot(), tracks, cfg.loop.main_segment), tracks)
     write_pose_graph(out / "posegraph.g2o", map_.T_wk, loop_closing.build_pose_graph(builder, accepted, cfg.loop))

@@ -68,6 +68,7 @@ def refine(
         shape_edges=cfg.optimize.shape_edges,
         iterations=cfg.optimize.iterations,
         progress=tools.progress,
+        workers=tools.workers,
     )
     summary = {} if result is None else {"cost": [*cost, result.cost[-1]], "outliers": int((~result.is_inlier).sum())}
     return tracks, sensing, summary

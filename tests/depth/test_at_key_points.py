@@ -73,3 +73,19 @@ def test_the_slope_of_a_noisy_plane_is_unbiased_and_far_more_certain_than_neighb
     per_px = sigma / z**2
     assert abs(np.mean(slope - 0.0004)) < 0.05 * np.mean(per_px)
     assert 0.002 * np.mean(per_px) < np.std(slope - 0.0004) < 0.03 * np.mean(per_px)
+
+
+def test_outlines_are_told_as_by_the_slow_twin_at_every_pixel() -> None:
+    rng = np.random.default_rng(0)
+    depth = (2.0 + np.cumsum(rng.normal(0, 0.02, (40, 50)), axis=1) + (rng.random((40, 50)) < 0.05)).astype(np.float32)
+    depth[rng.random(depth.shape) < 0.1] = np.nan
+    row, column = (axis.ravel() for axis in np.mgrid[:40, :50])
+
+    def inverse(down: int, right: int) -> np.ndarray:
+        return np.float32(1.0) / depth[np.clip(row + 3 * down, 0, 39), np.clip(column + 3 * right, 0, 49)]
+
+    bend = [inverse(d, r) + inverse(-d, -r) - 2 * inverse(0, 0) for d, r in ((0, 1), (1, 0), (1, 1), (1, -1))]
+    expected = (np.array(bend) > np.float32(0.05 * 640 / 50) * inverse(0, 0)).any(axis=0)
+    found = at_key_points.is_behind_outline(depth, np.stack([column, row], axis=1).astype(np.float32), jump=0.05)
+    assert 50 < expected.sum() < 1500
+    np.testing.assert_array_equal(found, expected)

@@ -196,7 +196,7 @@ def test_a_second_look_joins_key_frames_that_see_the_same_and_moves_them_to_wher
     )
     reliefs = Reliefs(CoarseDepth(corner().coarse_depth[frames]), KINECT, SENSOR)
     sensing = Sensing(KINECT, Timing(np.array(0.0), np.array(0.0), np.array(0.0), np.zeros((n, 6))), {})
-    look = {"reliefs": reliefs, "iterations": 20, "progress": lambda items, label: items}
+    look = {"reliefs": reliefs, "iterations": 20, "progress": lambda items, *_: items}
     after, result = final_refinement.look_again(builder, tracks, sensing, SENSOR, TrackConfig(), shape_edges=most, **look)
     assert len(builder.edge) == {0: 0, 1: 3, 6: 6}[most]
     assert (after.state == KEY_FRAME).all() and result.cost[-1] < result.cost[0]
@@ -206,3 +206,14 @@ def test_a_second_look_joins_key_frames_that_see_the_same_and_moves_them_to_wher
     assert 1e-4 < error < 0.01 if most else error > 0.02
     final_refinement.look_again(builder, after, sensing, SENSOR, TrackConfig(), shape_edges=most, **look)
     assert len(builder.edge) == {0: 0, 1: 3, 6: 6}[most], "no pair is joined twice"
+
+
+def test_key_frames_are_joined_the_same_with_any_number_of_threads():
+    frames, found = [0, 2, 4, 6], []
+    reliefs = Reliefs(CoarseDepth(corner().coarse_depth[frames]), KINECT, SENSOR)
+    for workers in (1, 3):
+        builder = revisit(frames)
+        assert Shape(builder, reliefs, reliefs).join_covisible(np.tile(np.eye(4), (4, 1, 1)), most=6, least=30, workers=workers) == 6
+        found.append(builder.edge)
+    for name in ("kf", "T_ij", "information"):
+        np.testing.assert_array_equal(getattr(found[1], name), getattr(found[0], name))

@@ -119,10 +119,23 @@ def test_hindsight_finds_lost_frames_and_keeps_the_rest(turn):
     tracks = replace(tracks, **{name: getattr(tracks, name).copy() for name in ("state", "ref_kf", "T_kc")})
     tracks.state[40:44], tracks.ref_kf[40:44], tracks.T_kc[40:44] = LOST, -1, np.nan
     builder = MapBuilder.from_map(scene.features, map_)
-    after = final_refinement.refine_frames(builder, scene.features, tracks, CAMERA, SENSOR, TrackConfig(), lambda items, label: items)
+    after = final_refinement.refine_frames(builder, scene.features, tracks, CAMERA, SENSOR, TrackConfig(), lambda items, *_: items)
     assert (after.state != LOST).all()
     error = [ape(frame_poses(t, map_), scene.T_gc) for t in (tracks, after)]
     assert 1e-4 < error[1] < error[0] + 0.001
+
+
+def test_hindsight_finds_the_same_with_any_number_of_threads(turn):
+    scene, tracks, map_ = turn
+    found = []
+    for workers in (1, 2, 4):
+        builder = MapBuilder.from_map(scene.features, map_)
+        look = (builder, scene.features, tracks, CAMERA, SENSOR, TrackConfig(), lambda items, *_: items)
+        found.append(final_refinement.refine_frames(*look, workers=workers))
+    assert (found[0].T_kc != tracks.T_kc).any()
+    for other in found[1:]:
+        for name in ("ref_kf", "T_kc", "state", "n_inliers"):
+            np.testing.assert_array_equal(getattr(other, name), getattr(found[0], name))
 
 
 def test_hindsight_matches_key_frames_again_and_the_world_stays_where_it_is(turn):
@@ -133,7 +146,7 @@ def test_hindsight_matches_key_frames_again_and_the_world_stays_where_it_is(turn
     noise[0] = np.eye(4)
     builder.kf.T_wk[:] = builder.kf.T_wk @ noise
     shaken = builder.kf.T_wk.copy()
-    found = final_refinement.refine_frames(builder, scene.features, tracks, CAMERA, SENSOR, TrackConfig(), lambda items, label: items)
+    found = final_refinement.refine_frames(builder, scene.features, tracks, CAMERA, SENSOR, TrackConfig(), lambda items, *_: items)
     assert (builder.kf.T_wk == shaken).all(), "to refine frames leaves the map as it is"
     seen, landmarks = frame_poses(found, builder.snapshot()), builder.snapshot().lm_xyz
     after = final_refinement.move_key_frames(builder, found)
@@ -153,7 +166,7 @@ def test_a_key_frame_that_shape_held_keeps_its_pose(turn):
     found = [
         final_refinement.refine_frames(
             MapBuilder.from_map(scene.features, map_), scene.features, tracks, CAMERA, SENSOR, replace(TrackConfig(), shape_below=least),
-            lambda items, label: items,
+            lambda items, *_: items,
         )
         for least in (10 * most, 0)
     ]  # fmt: skip
