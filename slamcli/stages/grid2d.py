@@ -1,5 +1,6 @@
 """grid2d: the 2-D navigation grid, from the depth of well-spaced frames or from the octree."""
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -54,5 +55,13 @@ def _from_depth(inputs: Inputs, T_lw: np.ndarray, cfg: Config, tools: Tools) -> 
         return look(depth, rays, T_ld, settings=option, sensor=cfg.sensor)
 
     spaced = tools.progress([poses[row] for row in chosen.tolist()], "grid2d")
-    views = list(read_depth(inputs.dataset, camera, spaced, look_at, workers=tools.workers, warn=tools.warn))
-    return grid.fuse(views, settings=option), len(views)
+    n_views = 0
+
+    def views() -> Iterator[View]:
+        """Hand each view on at once: together their lines of sight would fill much memory."""
+        nonlocal n_views
+        for view in read_depth(inputs.dataset, camera, spaced, look_at, workers=tools.workers, warn=tools.warn):
+            n_views += 1
+            yield view
+
+    return grid.fuse(views(), settings=option), n_views
