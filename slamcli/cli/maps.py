@@ -25,18 +25,19 @@ out_argument = click.argument("out", type=click.Path(path_type=Path, dir_okay=Fa
 @run_option
 @click.option("--frame", type=click.Choice(["level", "world"]), default="level", show_default=True, help="level: z up, floor at z = 0.")
 def export_cloud(out: Path, run: str | None, frame: str) -> None:
-    """Write the coloured cloud with normals to OUT (.ply or .pcd).
+    """Write the coloured cloud to OUT: .ply and .pcd with normals, .las and .laz for surveyors' programs.
 
     \b
       slamcli export-cloud cloud.ply
       slamcli export-cloud cloud.pcd --frame world
+      slamcli export-cloud cloud.laz
     """
     from slamcli.formats import cloud
     from slamcli.geometry import se3
     from slamcli.runs.run_directory import RunDir
     from slamcli.schema import Ground
 
-    _check_suffix(out, ".ply", ".pcd")
+    _check_suffix(out, *cloud.WRITERS)
     folder = RunDir.find(run)
     xyz, rgb, normal = cloud.read_ply(folder.stage_path("densify", "cloud.ply"))
     if frame == "world":
