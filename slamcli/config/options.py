@@ -346,6 +346,8 @@ class GridConfig:
     min_range: float = option(0.3, "nearer readings are ignored [m]", ge=0)
     max_range: float = option(4.0, "farther readings are ignored [m]", gt=0, le=100)
     extend_down: bool = option(True, "an upright surface that leaves the picture downwards is taken to reach the floor")
+    own_body: bool = option(True, "leave out parts of the picture that show the same near depth in every view: the robot's own body")
+    mask: str = option("", "picture of a depth image's size: where it is not black, depth is left out, such as over a bumper", is_file=True)
     driven: float = option(0.0, "floor within this of the camera's path is free: for recordings made on a robot; 0 = off [m]", ge=0, le=5)
     n_low: int = option(4, "n_l of (20): a cell with fewer points in a view is empty", ge=1)
     n_high: int = option(12, "n_h of (20): a cell with more points in a view is occupied", ge=1)
@@ -356,6 +358,16 @@ class GridConfig:
     p_floor: float = option(0.01, "probabilities are kept this far from 0 and 1", gt=0, lt=0.5)
     m_low: float = option(0.05, "m_l of (24): free below; 0.05 asks for two views, as one may be a slip", gt=0, lt=1)
     m_high: float = option(0.6, "m_h of (24): occupied above", gt=0, lt=1)
+
+
+@dataclass(frozen=True)
+class RobotConfig:
+    """The robot that the grid is for, as plan and export-grid need it; its height and what it climbs are grid2d.band_high and band_low."""
+
+    radius: float = option(0.2, "radius of the circle that the robot fits into [m]", ge=0, le=100)
+    mount: str = option(
+        "", "where the camera's body is on the robot's base: x,y,z,roll,pitch,yaw [m, rad] as a URDF origin; empty = not told"
+    )
 
 
 @dataclass(frozen=True)
@@ -376,3 +388,4 @@ class Config:
     ground: GroundConfig = field(default_factory=GroundConfig)
     octree: OctreeConfig = field(default_factory=OctreeConfig)
     grid2d: GridConfig = field(default_factory=GridConfig)
+    robot: RobotConfig = field(default_factory=RobotConfig)
