@@ -88,7 +88,10 @@ def _export_colour_octree(out: Path, folder: RunDir) -> None:
     "--min-area", type=click.FloatRange(0.0), default=0.01, show_default=True, help="Loose parts that are smaller are left out [m2]."
 )
 @click.option("--triangles", type=click.IntRange(4), help="Decimate to at most so many.")
-def export_mesh(out: Path, run: str | None, voxel: float, min_area: float, triangles: int | None) -> None:
+@click.option(
+    "--even-colours/--raw-colours", default=None, help="Even out exposure and white balance. [default: the run's densify.even_colours]"
+)
+def export_mesh(out: Path, run: str | None, voxel: float, min_area: float, triangles: int | None, even_colours: bool | None) -> None:
     """Make a coloured triangle mesh of the key frames' depth and write it to OUT: .glb, .obj or .ply.
 
     It is in the level frame (z up, metres); a .glb file has y up, as its standard asks.
@@ -103,7 +106,7 @@ def export_mesh(out: Path, run: str | None, voxel: float, min_area: float, trian
     from slamcli.runs.run_directory import RunDir
 
     suffix = _check_suffix(out, *WRITERS)
-    mesh = mesh_cleaning.without_islands(_mesh(RunDir.find(run), voxel), min_area=min_area)
+    mesh = mesh_cleaning.without_islands(_mesh(RunDir.find(run), voxel, even_colours), min_area=min_area)
     if triangles is not None:
         mesh = mesh_cleaning.decimated(mesh, triangles=triangles)
     if not len(mesh.triangle):
@@ -112,7 +115,7 @@ def export_mesh(out: Path, run: str | None, voxel: float, min_area: float, trian
     click.echo(f"{out}: {len(mesh.triangle)} triangles", err=True)
 
 
-def _mesh(folder: RunDir, voxel: float) -> Mesh:
+def _mesh(folder: RunDir, voxel: float, even_colours: bool | None) -> Mesh:
     from dataclasses import replace
 
     from slamcli import console
@@ -123,10 +126,13 @@ def _mesh(folder: RunDir, voxel: float) -> Mesh:
 
     config, camera, T_lw = folder.config(), folder.camera("loop"), folder.load(Ground, "densify").T_lw
     option = replace(config.densify, method="tsdf", voxel=voxel)
-    poses = console.progress(depth_poses(folder), "mesh")
+    poses, read = depth_poses(folder), (folder.dataset(), camera)
+    gains = {}
+    if option.even_colours if even_colours is None else even_colours:
+        gains = densify.colour_gains(*read, console.progress(poses, "colours"), config.sensor, option, workers=config.run.workers)
     volume = Volume(camera, voxel=voxel, depth_max=option.depth_max)
-    for view in densify.views(folder.dataset(), camera, poses, config.sensor, option, workers=config.run.workers):
-        volume.add(view.seen, view.rgb, view.T_wk)
+    for view in densify.views(*read, console.progress(poses, "mesh"), config.sensor, option, workers=config.run.workers):
+        volume.add(view.seen, view.evened(gains), view.T_wk)
     return volume.mesh().moved(T_lw)
 
 
