@@ -126,48 +126,80 @@ def normals(points: np.ndarray) -> np.ndarray:
     return out
 
 
-def sorted_points(depth, rays, T, corner, stride, cell, near, far, low, high, base, quadratic, side):
-    """Band points, their height slices and floor marks per cell, one pixel at a time."""
-    n_band, layers, floor = np.zeros((side, side), int), np.zeros((side, side), np.uint16), np.zeros((side, side), bool)
+def sorted_points(depth, rays, T, corner, stride, cell, near, far, low, high, drop, base, quadratic, side):
+    """Band points, their height slices, floor marks, holes and tops per cell, one pixel at a time."""
+    n_band, layers = np.zeros((side, side), int), np.zeros((side, side), np.uint16)
+    top, floor, hole = np.zeros((side, side), bool), np.zeros((side, side), int), np.zeros((side, side), int)
 
     def point(v, u):
         return T[:3, :3] @ (depth[v, u] * np.array([*rays[v, u].astype(float), 1.0])) + T[:3, 3]
 
-    def mark(xy):
+    def at(xy):
         j, i = np.floor(xy / cell - corner).astype(int)
-        if 0 <= i < side and 0 <= j < side:
-            floor[i, j] = True
+        return (i, j) if 0 <= i < side and 0 <= j < side else None
+
+    def is_level(v, u, x, slope):
+        """Upright surfaces rise from row to row by what the rows are apart."""
+        if slope[2] >= 0 or v < stride:
+            return False
+        row_apart = z * (T[2, :3] @ np.array([*rays[v - stride, u].astype(float), 1.0]) - slope[2])
+        return abs(point(v - stride, u)[2] - x[2]) < 0.5 * row_apart
 
     for v in range(stride // 2, depth.shape[0], stride):
         for u in range(stride // 2, depth.shape[1], stride):
             z = float(depth[v, u])
-            if not near <= z <= far:
+            if not near <= z:
                 continue
             x = point(v, u)
-            j, i = np.floor(x[:2] / cell - corner).astype(int)
             slope = (x - T[:3, 3]) / z
             noise = 2.0 * abs(slope[2]) * (base + quadratic * (z - 0.4) ** 2)
-            if x[2] >= high or not (0 <= i < side and 0 <= j < side):
+            if x[2] < -drop - noise:
+                reach = T[2, 3] / -slope[2]
+                if reach <= far and (place := at(T[:2, 3] + reach * slope[:2])):
+                    hole[place] += 1
                 continue
-            if x[2] >= low + noise:
-                n_band[i, j] += 1
-                layers[i, j] |= np.uint16(1 << int(16 * (x[2] - low) / (high - low)))
-            elif x[2] > -low - noise and slope[2] < 0 and v >= stride:
-                # Upright surfaces rise from row to row by what the rows are apart.
-                above = point(v - stride, u)
-                row_apart = z * (T[2, :3] @ np.array([*rays[v - stride, u].astype(float), 1.0]) - slope[2])
-                if not abs(above[2] - x[2]) < 0.5 * row_apart:
-                    continue
-                mark(x[:2])
+            place = at(x[:2])
+            if z > far or place is None:
+                continue
+            if x[2] >= high:
+                top[place] |= x[2] < high + 0.3 and is_level(v, u, x, slope)
+            elif x[2] >= low + noise:
+                n_band[place] += 1
+                layers[place] |= np.uint16(1 << int(16 * (x[2] - low) / (high - low)))
+            elif x[2] > -low - noise and is_level(v, u, x, slope):
+                floor[place] = 2
                 back = min(low - max(x[2], 0.0), T[2, 3] - x[2]) / -slope[2]
                 steps = int(back * np.linalg.norm(slope[:2]) / cell)
                 for s in range(1, steps + 1):
-                    mark(x[:2] - back * s / (steps + 1) * slope[:2])
-    return n_band, layers, floor
+                    if before := at(x[:2] - back * s / (steps + 1) * slope[:2]):
+                        floor[before] = max(floor[before], 1)
+    return n_band, layers, floor, hole, top
 
 
-def is_clear(standing, row, column, camera_x, camera_y, camera_z, low, high, reach):
-    """Follow the line from a cell's floor to the camera, looking for something that hangs above it."""
+def crossed_slices(depth, rays, T, corner, stride, cell, near, far, low, high, base, quadratic, side):
+    """The slices of the band that lines of sight cross, as a set of (row, column, slice), one step along one pixel's line at a time."""
+    crossed = set()
+    for v in range(stride // 2, depth.shape[0], stride):
+        for u in range(stride // 2, depth.shape[1], stride):
+            z = float(depth[v, u])
+            if not near <= z:
+                continue
+            slope = T[:3, :3] @ np.array([*rays[v, u].astype(float), 1.0])
+            ends = sorted((edge - T[2, 3]) / slope[2] for edge in (low, high))
+            first, last = max(near, ends[0]), min(far, z - 2.0 * (base + quadratic * (z - 0.4) ** 2) - cell, ends[1])
+            if not first < last:
+                continue
+            n = int(np.ceil((last - first) * np.abs(slope[:2]).max() / cell)) + 1
+            for t in first + (last - first) * (np.arange(n) + 0.5) / n:
+                x = T[:3, 3] + t * slope
+                j, i = np.floor(x[:2] / cell - corner).astype(int)
+                if 0 <= i < side and 0 <= j < side:
+                    crossed.add((i, j, int(16 * (x[2] - low) / (high - low))))
+    return crossed
+
+
+def is_clear(standing, is_open, face, around, row, column, camera_x, camera_y, camera_z, low, high, reach):
+    """Follow the line from a cell's floor to the camera, looking for something that hangs above it and may reach as far as the cell."""
     start, end = np.array([column + 0.5, row + 0.5]), np.array([camera_x, camera_y])
     steps = int(np.ceil(np.abs(end - start).max()))
     for s in range(steps + 1):
@@ -178,10 +210,14 @@ def is_clear(standing, row, column, camera_x, camera_y, camera_z, low, high, rea
         j, i = np.floor(start + t * (end - start)).astype(int)
         if not (0 <= i < standing.shape[0] and 0 <= j < standing.shape[1]):
             return True
+        if face[i, j] > 0 and around[row, column] != face[i, j]:
+            continue
         k = int(16 * max(height - low, 0.0) / (high - low))
-        above = any(standing[i, j] >> b & 1 for b in range(k + 3, 16))
-        around = any(standing[i, j] >> b & 1 for b in range(max(k - 2, 0), min(k + 3, 16)))
-        if above and not around:
+        above = {b for b in range(k + 3, 16) if standing[i, j] >> b & 1}
+        beside = any(standing[i, j] >> b & 1 for b in range(max(k - 2, 0), min(k + 3, 16)))
+        core = {b for b in above if b - 1 in above and (b + 1 in above or b == 15)}
+        is_passed = bool(core) and all(is_open[row, column] >> b & 1 for b in core)
+        if above and not beside and not is_passed:
             return False
     return True
 

@@ -1,13 +1,26 @@
-"""slamcli export-trajectory."""
+"""slamcli export-trajectory, export-colmap, export-nerfstudio."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from slamcli.cli.common import Target, check_ending, json_option, mount_option, run_option
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from slamcli.runs.posed_images import PosedImages
+    from slamcli.runs.run_directory import RunDir
+
+CLOUD = "sparse_pc.ply"  # the name under which nerfstudio's own converters write it
+
+
+LAYOUT_OF = {".txt": "tum", ".tum": "tum", ".kitti": "kitti", ".csv": "csv"}
 
 
 @click.command("export-trajectory")
@@ -15,14 +28,17 @@ from slamcli.cli.common import Target, check_ending, json_option, mount_option, 
 @run_option
 @click.option("--stage", type=click.Choice(["track", "optimize", "loop"]), help="Whose trajectory; default: the last there is.")
 @click.option("--frame", type=click.Choice(["world", "level"]), default="world", show_default=True, help="level: z up, floor at z = 0.")
-@click.option("--format", "layout", type=click.Choice(["tum", "kitti"]), default="tum", show_default=True, help="kitti has no time stamps.")
+@click.option(
+    "--format", "layout", type=click.Choice(["tum", "kitti", "csv"]), help="[default: by OUT's ending]; kitti has no time stamps."
+)
 @mount_option
 @json_option
 def export_trajectory(
-    out: Path, run: str | None, stage: str | None, frame: str, layout: str, mount: tuple[float, ...] | None, as_json: bool
+    out: Path, run: str | None, stage: str | None, frame: str, layout: str | None, mount: tuple[float, ...] | None, as_json: bool
 ) -> None:
-    """Write the camera's trajectory to OUT (.txt, .tum, .csv or .kitti): pose of the colour camera, camera to world.
+    """Write the camera's trajectory to OUT: pose of the colour camera, camera to world.
 
+    .txt and .tum hold TUM's format, .kitti KITTI's, .csv a table with a line of names; .g2o is the pose graph of loop, in the world frame.
     With --mount it is the robot's base instead: x ahead, y left, z up.
 
     \b
@@ -30,13 +46,17 @@ def export_trajectory(
       slamcli export-trajectory base.txt --frame level --mount 0.1,0,0.3,0,0.2,0
     """
     from slamcli.evaluation import trajectory_error
-    from slamcli.formats.trajectory import write_kitti, write_tum
+    from slamcli.formats.trajectory import WRITERS
     from slamcli.navigation.robot_pose import base_in_camera
     from slamcli.runs.run_directory import RunDir
     from slamcli.schema import Ground, Trajectory
 
-    check_ending(out, ".txt", ".tum", ".csv", ".kitti")
+    ending = check_ending(out, *LAYOUT_OF, ".g2o")
     folder = RunDir.find(run)
+    if ending == ".g2o":
+        _export_graph(out, folder, is_plain=(stage or "loop") == "loop" and frame == "world" and mount is None and layout is None)
+        return
+    layout = layout or LAYOUT_OF[ending]
     trajectory = trajectory_error.stage_trajectory(folder, stage or trajectory_error.last_stage(folder))
     T_wc = trajectory.T_wc
     if frame == "level":
@@ -46,7 +66,7 @@ def export_trajectory(
         T_wc = ground.T_lw @ T_wc
     if mount is not None:
         T_wc = T_wc @ base_in_camera(mount)
-    (write_kitti if layout == "kitti" else write_tum)(out, Trajectory(stamp=trajectory.stamp, T_wc=T_wc))
+    WRITERS[layout](out, Trajectory(stamp=trajectory.stamp, T_wc=T_wc))
     n_frames = trajectory_error.frame_count(folder)
     if as_json:
         click.echo(json.dumps({"out": str(out), "poses": len(trajectory.stamp), "frames": n_frames, "frame": frame, "format": layout}))
@@ -57,3 +77,115 @@ def export_trajectory(
         else ""
     )
     click.echo(f"{out}: {len(trajectory.stamp)} poses of {n_frames} frames{note}", err=True)
+
+
+def _export_graph(out: Path, folder: RunDir, *, is_plain: bool) -> None:
+    from slamcli.errors import SlamError
+    from slamcli.files import write_bytes
+
+    if not is_plain:
+        raise SlamError(
+            f"{out}: a pose graph is loop's, of the camera in the world frame; leave out --stage, --frame, --mount and --format"
+        )
+    source = folder.stage_path("loop", "posegraph.g2o")
+    write_bytes(out, source.read_bytes())
+    click.echo(f"{out}: {out.stat().st_size} bytes", err=True)
+
+
+out_folder = click.argument("out", type=click.Path(path_type=Path, file_okay=False))
+frames_option = click.option(
+    "--frames",
+    type=click.Choice(["key", "all"]),
+    default="key",
+    show_default=True,
+    help="Whose images: key frames, or all that have a pose.",
+)
+images_option = click.option(
+    "--images", type=click.Choice(["png", "jpg"]), default="png", show_default=True, help="How images are written."
+)
+
+
+@click.command("export-colmap")
+@out_folder
+@run_option
+@frames_option
+@images_option
+@click.option("--text", "as_text", is_flag=True, help="Write the model as text instead of binary.")
+def export_colmap(out: Path, run: str | None, frames: str, images: str, as_text: bool) -> None:
+    """Write a COLMAP model into the new folder OUT: images/ and sparse/0/, in the level frame (z up, metres).
+
+    It holds the landmarks with their tracks. Images are as recorded, with the lens in the camera's parameters; for programs that need
+    pinhole images: colmap image_undistorter.
+
+    \b
+      slamcli export-colmap colmap
+      slamcli export-colmap colmap --frames all --images jpg
+    """
+    from slamcli.formats import colmap
+    from slamcli.runs import posed_images
+    from slamcli.runs.run_directory import RunDir
+
+    folder = RunDir.find(run)
+    _check_new(out)
+    camera, posed = folder.camera("loop"), posed_images.posed_images(folder, frames=frames)
+    names = _image_names(posed, images)
+    colours = posed_images.PointColours(posed_images.sparse_model(folder, camera, posed, names))
+    (out / "sparse" / "0").mkdir(parents=True)
+    (out / "images").mkdir()
+    _write_pictures(out / "images", folder, posed, names, colours.look)
+    model = colours.model()
+    (colmap.write_text if as_text else colmap.write_binary)(out / "sparse" / "0", model)
+    error = f", mean reprojection error {float(model.error.mean()):.2f} px" if len(model.error) else ""
+    click.echo(f"{out}: {len(names)} images, {len(model.xyz)} points{error}", err=True)
+
+
+@click.command("export-nerfstudio")
+@out_folder
+@run_option
+@frames_option
+@images_option
+def export_nerfstudio(out: Path, run: str | None, frames: str, images: str) -> None:
+    """Write transforms.json, images, depth and the cloud into the new folder OUT, for nerfstudio and Gaussian splatting.
+
+    Poses are in the level frame (z up, metres); depth is in millimetres; splatting starts from the cloud, sparse_pc.ply.
+
+    \b
+      slamcli export-nerfstudio room && ns-train splatfacto --data room
+    """
+    from slamcli.formats import cloud, nerfstudio
+    from slamcli.runs import posed_images
+    from slamcli.runs.run_directory import RunDir
+
+    folder = RunDir.find(run)
+    _check_new(out)
+    camera, posed = folder.camera("loop"), posed_images.posed_images(folder, frames=frames)
+    names = [f"images/{name}" for name in _image_names(posed, images)]
+    for part in ("images", "depth"):
+        (out / part).mkdir(parents=True)
+    _write_pictures(out, folder, posed, names, lambda row, rgb: None)
+    depth_names = [f"depth/{Path(name).stem}.png" for name in names]
+    workers = folder.config().run.workers
+    depth = posed_images.write_depth(out, folder.dataset(), camera, posed.frame.tolist(), depth_names, workers=workers)
+    xyz, rgb, _ = cloud.read_ply(folder.stage_path("densify", "cloud.ply"))
+    cloud.write_ply(out / CLOUD, xyz, rgb)
+    nerfstudio.write_transforms(out / "transforms.json", camera, posed.T_lc, image=names, depth=depth, cloud=CLOUD)
+    click.echo(f"{out}: {len(names)} images, {sum(map(bool, depth))} with depth, {len(xyz)} points", err=True)
+
+
+def _check_new(out: Path) -> None:
+    from slamcli.errors import SlamError
+
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise SlamError(f"{out}: exists already; name a new folder")
+
+
+def _image_names(posed: PosedImages, ending: str) -> list[str]:
+    return [f"frame_{frame:06d}.{ending}" for frame in posed.frame.tolist()]
+
+
+def _write_pictures(out: Path, folder: RunDir, posed: PosedImages, names: list[str], look: Callable[[int, np.ndarray], None]) -> None:
+    from slamcli import console
+    from slamcli.runs import posed_images
+
+    frames = console.progress(posed.frame.tolist(), "images")
+    posed_images.write_pictures(out, folder.dataset(), frames, names, workers=folder.config().run.workers, look=look)

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from slamcli.cli.common import Target, json_option, mount_option, run_option
+from slamcli.cli.common import Mount, Target, json_option, mount_option, run_option
+from slamcli.errors import SlamError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -76,11 +77,20 @@ def export_grid(out: Path, run: str | None, png: Path | None, mount: tuple[float
 
 
 def _start(folder: RunDir, mount: tuple[float, ...] | None) -> tuple[float, float, float]:
-    """Return x, y, yaw in the level frame of the first frame's camera or, where it is mounted on one, of the robot's base."""
+    """Return x, y, yaw in the level frame of the first frame's camera or, where it is mounted on one, of the robot's base.
+
+    mount : of the command; else the run's robot.mount
+    """
     from slamcli.navigation.robot_pose import base_in_camera, base_pose
     from slamcli.runs import placement
     from slamcli.schema import Ground
 
+    told = folder.config().robot.mount
+    if mount is None and told:
+        try:
+            mount = Mount().convert(told, None, None)
+        except click.BadParameter as error:
+            raise SlamError(f"robot.mount = {error.message}") from error
     if mount is None:
         return placement.read(folder).first
     return base_pose(folder.load(Ground, "densify").T_lw @ placement.camera_poses(folder)[0], base_in_camera(mount))
@@ -93,7 +103,7 @@ def _start(folder: RunDir, mount: tuple[float, ...] | None) -> tuple[float, floa
 @click.option("--goal", type=Place(), required=True, help="Where it is to go: x,y [m], first or last.")
 @run_option
 @click.option("--map", "page", type=click.Path(path_type=Path, dir_okay=False), help="Plan on this grid map (.yaml) instead of the run's.")
-@click.option("--radius", default=0.2, show_default=True, help="Of the robot [m].")
+@click.option("--radius", type=float, help="Of the robot [m]. [default: the run's robot.radius]")
 @click.option("--clearance", default=0.3, show_default=True, help="Being nearer to obstacles than this beyond the radius costs [m].")
 @click.option("--weight", default=3.0, show_default=True, help="How much more a metre along an obstacle costs than one in the open.")
 @click.option("--allow-unknown", is_flag=True, help="Drive through cells that were never seen, too.")
@@ -101,7 +111,7 @@ def _start(folder: RunDir, mount: tuple[float, ...] | None) -> tuple[float, floa
 @click.option("--png", type=Target(own="plan.png"), help="Draw the path. [default: plan.png in the run directory]")
 @json_option
 def plan(
-    start: tuple[float, float] | str, goal: tuple[float, float] | str, run: str | None, page: Path | None, radius: float, clearance: float,
+    start: tuple[float, float] | str, goal: tuple[float, float] | str, run: str | None, page: Path | None, radius: float | None, clearance: float,
     weight: float, allow_unknown: bool, out: Path | None, png: Path | None, as_json: bool,
 ) -> None:  # fmt: skip
     """Plan a path on the navigation grid and draw it; prints it as CSV: x,y,clearance in metres, level frame.
@@ -113,6 +123,7 @@ def plan(
       slamcli plan --start 0.5,1.0 --goal 3,2
       slamcli plan --start 0.5,1.0 --goal 3,2 -o path.json --png path.png
     """
+    from slamcli.config.options import Config
     from slamcli.navigation import planner
     from slamcli.runs.run_directory import RunDir
     from slamcli.schema import Grid
@@ -124,9 +135,11 @@ def plan(
         grid = folder.load(Grid, "grid2d")
         warn_without_floor(folder)
         trajectory, title = camera_path(folder), str(folder.info()["dataset"])
+        radius = folder.config().robot.radius if radius is None else radius
         png = png or folder.path / "plan.png"
     else:
         grid, title = _read_map(page), page.name
+    radius = Config().robot.radius if radius is None else radius
     start, goal = _ends(grid, start, goal, trajectory, radius=radius, allow_unknown=allow_unknown)
     route = planner.plan(grid, start, goal, radius=radius, clearance=clearance, weight=weight, allow_unknown=allow_unknown)
     texts = {".csv": _csv(route), ".json": _json(route, start, goal, radius)}
@@ -190,7 +203,6 @@ def _json(route: Route, start: tuple[float, float], goal: tuple[float, float], r
 
 def _write(out: Path, texts: dict[str, str]) -> None:
     from slamcli import files
-    from slamcli.errors import SlamError
 
     if out.suffix not in texts:
         raise SlamError(f"{out}: a path is written as .csv or .json")

@@ -14,6 +14,7 @@ from slamcli.errors import SlamError
 if TYPE_CHECKING:
     import numpy as np
 
+    from slamcli.dense.tsdf import Mesh
     from slamcli.runs.run_directory import RunDir
     from slamcli.visualization.render import View
 
@@ -25,18 +26,19 @@ out_argument = click.argument("out", type=Target())
 @run_option
 @click.option("--frame", type=click.Choice(["level", "world"]), default="level", show_default=True, help="level: z up, floor at z = 0.")
 def export_cloud(out: Path, run: str | None, frame: str) -> None:
-    """Write the coloured cloud with normals to OUT (.ply or .pcd).
+    """Write the coloured cloud to OUT: .ply and .pcd with normals, .las and .laz for surveyors' programs.
 
     \b
       slamcli export-cloud cloud.ply
       slamcli export-cloud cloud.pcd --frame world
+      slamcli export-cloud cloud.laz
     """
     from slamcli.formats import cloud
     from slamcli.geometry import se3
     from slamcli.runs.run_directory import RunDir
     from slamcli.schema import Ground
 
-    _check_suffix(out, ".ply", ".pcd")
+    _check_suffix(out, *cloud.WRITERS)
     folder = RunDir.find(run)
     xyz, rgb, normal = cloud.read_ply(folder.stage_path("densify", "cloud.ply"))
     if frame == "world":
@@ -84,36 +86,56 @@ def _export_colour_octree(out: Path, folder: RunDir) -> None:
 @out_argument
 @run_option
 @click.option("--voxel", type=click.FloatRange(0.002, 0.5), default=0.02, show_default=True, help="Resolution of the surface [m].")
-def export_mesh(out: Path, run: str | None, voxel: float) -> None:
-    """Make a coloured triangle mesh of the key frames' depth and write it to OUT (.ply), in the level frame.
+@click.option(
+    "--min-area", type=click.FloatRange(0.0), default=0.01, show_default=True, help="Loose parts that are smaller are left out [m2]."
+)
+@click.option("--triangles", type=click.IntRange(4), help="Decimate to at most so many.")
+@click.option(
+    "--even-colours/--raw-colours", default=None, help="Even out exposure and white balance. [default: the run's densify.even_colours]"
+)
+def export_mesh(out: Path, run: str | None, voxel: float, min_area: float, triangles: int | None, even_colours: bool | None) -> None:
+    """Make a coloured triangle mesh of the key frames' depth and write it to OUT: .glb, .obj or .ply.
+
+    It is in the level frame (z up, metres); a .glb file has y up, as its standard asks.
 
     \b
-      slamcli export-mesh mesh.ply
+      slamcli export-mesh room.glb
       slamcli export-mesh fine.ply --voxel 0.01
+      slamcli export-mesh light.obj --triangles 50000
     """
+    from slamcli.dense import mesh_cleaning
+    from slamcli.formats.mesh import WRITERS
+    from slamcli.runs.run_directory import RunDir
+
+    suffix = _check_suffix(out, *WRITERS)
+    mesh = mesh_cleaning.without_islands(_mesh(RunDir.find(run), voxel, even_colours), min_area=min_area)
+    if triangles is not None:
+        mesh = mesh_cleaning.decimated(mesh, triangles=triangles)
+    if not len(mesh.triangle):
+        raise SlamError("the mesh is empty: no key frame has depth within densify.depth_max, or every part is smaller than --min-area")
+    WRITERS[suffix](out, mesh.xyz, mesh.triangle, mesh.rgb, mesh.normal)
+    click.echo(f"{out}: {len(mesh.triangle)} triangles", err=True)
+
+
+def _mesh(folder: RunDir, voxel: float, even_colours: bool | None) -> Mesh:
     from dataclasses import replace
 
     from slamcli import console
     from slamcli.dense.tsdf import Volume
-    from slamcli.formats.cloud import write_ply_mesh
-    from slamcli.runs.run_directory import RunDir
     from slamcli.schema import Ground
     from slamcli.stages import densify
     from slamcli.stages.depth_frames import depth_poses
 
-    _check_suffix(out, ".ply")
-    folder = RunDir.find(run)
     config, camera, T_lw = folder.config(), folder.camera("loop"), folder.load(Ground, "densify").T_lw
     option = replace(config.densify, method="tsdf", voxel=voxel)
-    poses = console.progress(depth_poses(folder), "mesh")
+    poses, read = depth_poses(folder), (folder.dataset(), camera)
+    gains = {}
+    if option.even_colours if even_colours is None else even_colours:
+        gains = densify.colour_gains(*read, console.progress(poses, "colours"), config.sensor, option, workers=config.run.workers)
     volume = Volume(camera, voxel=voxel, depth_max=option.depth_max)
-    for view in densify.views(folder.dataset(), camera, poses, config.sensor, option, workers=config.run.workers):
-        volume.add(view.seen, view.rgb, view.T_wk)
-    mesh = volume.mesh().moved(T_lw)
-    if not len(mesh.triangle):
-        raise SlamError("the mesh is empty: no key frame has depth within densify.depth_max")
-    write_ply_mesh(out, mesh.xyz, mesh.triangle, mesh.rgb, mesh.normal)
-    click.echo(f"{out}: {len(mesh.triangle)} triangles", err=True)
+    for view in densify.views(*read, console.progress(poses, "mesh"), config.sensor, option, workers=config.run.workers):
+        volume.add(view.seen, view.evened(gains), view.T_wk)
+    return volume.mesh().moved(T_lw)
 
 
 def _check_suffix(out: Path, *suffixes: str) -> str:

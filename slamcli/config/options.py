@@ -262,6 +262,7 @@ class DensifyConfig(SurfaceConfig):
     voxel: float = option(0.01, "voxel side of the cloud [m]", gt=0, le=1)
     stride: int = option(2, "every stride-th row and column of a depth image is used", ge=1, le=64)
     depth_max: float = option(4.0, "farther readings are ignored [m]", gt=0, le=100)
+    even_colours: bool = option(False, "even out exposure and white balance of key frames; reads every image twice")
     min_points: int = option(1, "voxels with fewer readings are dropped", ge=1)
     neighbours: int = option(6, "stray points are found by their mean distance to this many neighbours; 0 keeps all", ge=0, le=100)
     max_deviation: float = option(2.0, "points whose mean distance is so many standard deviations above average are dropped", gt=0)
@@ -312,15 +313,18 @@ class GridConfig:
     source: str = option("points", "what the grid is made from: the key frames' depth, or the octree", choices=("points", "octree"))
     band_low: float = option(0.05, "the robot drives over what is lower [m]", ge=0, le=10)
     band_high: float = option(0.5, "the robot's height: what is higher is passable [m]", gt=0, le=100)
+    drop: float = option(0.08, "an edge: a cell through whose floor something this much deeper was seen [m]", gt=0, le=10)
     spacing: float = option(0.12, "a frame is used when the camera moved so far since the last one [m]", gt=0)
     spacing_deg: float = option(12.0, "a frame is used when the camera turned so far since the last [degrees]", gt=0, le=180)
-    stride: int = option(4, "every so many pixels of depth are used [px]", ge=1, le=64)
+    stride: int = option(2, "every so many pixels of depth are used [px]", ge=1, le=64)
     min_range: float = option(0.3, "nearer readings are ignored [m]", ge=0)
     max_range: float = option(4.0, "farther readings are ignored [m]", gt=0, le=100)
     extend_down: bool = option(True, "an upright surface that leaves the picture downwards is taken to reach the floor")
+    own_body: bool = option(True, "leave out what shows the same near depth in every view: the robot's body")
+    mask: str = option("", "picture of depth's size; where it is not black, depth is left out", is_file=True)
     driven: float = option(0.0, "floor this near the camera's path is free, on a robot; 0 = off [m]", ge=0, le=5)
-    n_low: int = option(3, "n_l of (20): a cell with fewer points in a view is empty", ge=1)
-    n_high: int = option(8, "n_h of (20): a cell with more points in a view is occupied", ge=1)
+    n_low: int = option(4, "n_l of (20): a cell with fewer points in a view is empty", ge=1)
+    n_high: int = option(12, "n_h of (20): a cell with more points in a view is occupied", ge=1)
     update: str = option("evidence", "how views add up: log-odds, or (22), (23) as printed", choices=("evidence", "paper"))
     p_empty_empty: float = option(0.9, "P(E1|E2) of (22)", gt=0, lt=1)
     p_full_empty: float = option(0.1, "P(F1|E2) of (22)", gt=0, lt=1)
@@ -328,6 +332,16 @@ class GridConfig:
     p_floor: float = option(0.01, "probabilities are kept this far from 0 and 1", gt=0, lt=0.5)
     m_low: float = option(0.05, "m_l of (24): cells below are free; 0.05 asks for two views", gt=0, lt=1)
     m_high: float = option(0.6, "m_h of (24): occupied above", gt=0, lt=1)
+
+
+@dataclass(frozen=True)
+class RobotConfig:
+    """The robot that the grid is for, as plan and export-grid need it; its height and what it climbs are grid2d.band_high and band_low."""
+
+    radius: float = option(0.2, "radius of the circle that the robot fits into [m]", ge=0, le=100)
+    mount: str = option(
+        "", "where the camera's body is on the robot's base: x,y,z,roll,pitch,yaw [m, rad] as a URDF origin; empty = not told"
+    )
 
 
 @dataclass(frozen=True)
@@ -348,3 +362,4 @@ class Config:
     ground: GroundConfig = field(default_factory=GroundConfig)
     octree: OctreeConfig = field(default_factory=OctreeConfig)
     grid2d: GridConfig = field(default_factory=GridConfig)
+    robot: RobotConfig = field(default_factory=RobotConfig)

@@ -7,11 +7,14 @@ import cv2
 import numpy as np
 
 from slamcli.depth.oriented_points import Surface
+from slamcli.errors import SlamError
 from slamcli.geometry import se3
 from slamcli.geometry.camera import Camera
 from slamcli.open3d_loader import load_open3d
 
 BLOCK = 8  # voxels per side of the blocks that Open3D reserves; 16, its own default, takes twice the memory around thin surfaces
+BLOCK_BYTES = BLOCK**3 * 12  # distance, weight and colour of each voxel
+MAX_BLOCKS = 360_000  # 2 GiB, twice that while the table grows
 TRUNCATION = 4.0  # voxels on either side of the surface
 MIN_WEIGHT = 1.0  # readings that a voxel needs to be part of the surface
 
@@ -38,7 +41,7 @@ class Volume:
         """Start empty; `voxel` is the voxels' side, farther readings than `depth_max` are ignored [m]."""
         self._o3d = load_open3d()
         core = self._o3d.core
-        self._camera, self._depth_max = camera, float(depth_max)
+        self._camera, self._voxel, self._depth_max = camera, float(voxel), float(depth_max)
         self._grid = self._o3d.t.geometry.VoxelBlockGrid(
             attr_names=("tsdf", "weight", "color"),
             attr_dtypes=(core.float32, core.uint16, core.uint16),
@@ -65,6 +68,10 @@ class Volume:
         T_cw = self._o3d.core.Tensor(se3.inverse(T_wc))
         where = self._grid.compute_unique_block_coordinates(depth_image, self._K, T_cw, 1.0, self._depth_max, TRUNCATION)
         self._grid.integrate(where, depth_image, colour, self._K, T_cw, 1.0, self._depth_max, TRUNCATION)
+        if self._grid.hashmap().size() > MAX_BLOCKS:
+            raise SlamError(
+                f"a surface of {self._voxel:g} m voxels would fill more than {MAX_BLOCKS * BLOCK_BYTES >> 30} GiB of memory; make the voxels larger"
+            )
 
     def mesh(self) -> Mesh:
         """Extract the surface: W. Lorensen and H. Cline, Marching cubes, SIGGRAPH 1987, doi:10.1145/37401.37422."""

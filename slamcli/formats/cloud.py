@@ -8,6 +8,7 @@ import numpy as np
 
 from slamcli import files
 from slamcli.errors import SlamError
+from slamcli.formats.las import write_las
 
 Points = tuple[np.ndarray, np.ndarray | None, np.ndarray | None]  # xyz (N, 3) float32, rgb (N, 3) uint8, normal (N, 3) float32
 
@@ -27,8 +28,8 @@ PCD_KINDS = {
 
 
 def write(path: Path, xyz: np.ndarray, rgb: np.ndarray | None = None, normal: np.ndarray | None = None) -> None:
-    """Write points (N, 3), colours (N, 3) uint8 and normals (N, 3) in the format that the suffix names, .ply or .pcd."""
-    _by_suffix(path, {".ply": write_ply, ".pcd": write_pcd})(path, xyz, rgb, normal)
+    """Write points (N, 3), colours (N, 3) uint8 and normals (N, 3) in the format that the suffix names, one of `WRITERS`."""
+    _by_suffix(path, WRITERS)(path, xyz, rgb, normal)
 
 
 def read(path: Path) -> Points:
@@ -235,3 +236,6 @@ def _points(path: Path, columns: dict[str, np.ndarray]) -> Points:
         rgb = np.column_stack([bits >> 16 & 255, bits >> 8 & 255, bits & 255]).astype(np.uint8)
     normal = group("nx ny nz", np.float32)
     return xyz, rgb, normal if normal is not None else group("normal_x normal_y normal_z", np.float32)
+
+
+WRITERS: dict[str, Callable] = {".ply": write_ply, ".pcd": write_pcd, ".las": write_las, ".laz": write_las}

@@ -1,7 +1,8 @@
-"""Trajectory files: TUM (read and write) and KITTI (write).
+"""Trajectory files: TUM (read and write), KITTI and CSV (write).
 
 TUM, one pose a line: ``stamp tx ty tz qx qy qz qw``, camera to world, `#` starts a comment, commas and tabs may separate.
 KITTI, one pose a line: the upper 3 x 4 of the camera-to-world matrix row by row, without a stamp.
+CSV: a line of names, then the columns of TUM with commas between them.
 """
 
 from pathlib import Path
@@ -35,10 +36,18 @@ def read_tum(path: str | Path) -> Trajectory:
 
 def write_tum(path: str | Path, trajectory: Trajectory) -> None:
     """Write a TUM trajectory: stamps to the microsecond, positions to the nanometre."""
+    files.write_text(path, "# timestamp tx ty tz qx qy qz qw\n" + _lines(trajectory, between=" "))
+
+
+def write_csv(path: str | Path, trajectory: Trajectory) -> None:
+    """Write a table for spreadsheets and pandas, in the precision of `write_tum`."""
+    files.write_text(path, "timestamp,tx,ty,tz,qx,qy,qz,qw\n" + _lines(trajectory, between=","))
+
+
+def _lines(trajectory: Trajectory, *, between: str) -> str:
     quaternion = se3.quaternion_xyzw(trajectory.T_wc).reshape(-1, 4)
     rows = np.column_stack([trajectory.stamp, trajectory.T_wc[:, :3, 3], quaternion])
-    lines = [f"{row[0]:.6f} " + " ".join(f"{value:.9f}" for value in row[1:]) + "\n" for row in rows]
-    files.write_text(path, "# timestamp tx ty tz qx qy qz qw\n" + "".join(lines))
+    return "".join(between.join([f"{row[0]:.6f}", *(f"{value:.9f}" for value in row[1:])]) + "\n" for row in rows)
 
 
 def write_kitti(path: str | Path, trajectory: Trajectory) -> None:
@@ -72,3 +81,6 @@ def _parse(path: Path, number: int, line: str) -> list[float]:
     if max(abs(x) for x in row[:4]) > FARTHEST:
         raise SlamError(f"{path}:{number}: {line.strip()[:80]!r} holds a stamp or a place that no camera can have")
     return row
+
+
+WRITERS = {"tum": write_tum, "kitti": write_kitti, "csv": write_csv}

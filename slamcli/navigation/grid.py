@@ -1,26 +1,31 @@
 """The 2-D navigation grid, [L] section 3: what stands in a robot's way, what is free, what was never seen.
 
 Seeing the floor does not make a cell free: the floor is seen under a hanging box, too. So a first pass over the views gathers where, and
-at what height, something stands; a second one believes a floor point only when its line of sight passed under nothing. The second
-pass adds up the views by [L] (20) to (23), (24) decides.
+at what height, something stands, and where lines of sight crossed the band; a second one believes a floor point only when its line of
+sight passed under nothing that may reach as far as the point. The second pass adds up the views by [L] (20) to (23), (24) decides.
 """
 
 import math
 from collections.abc import Iterable
+from dataclasses import replace
 
 import numpy as np
-from numba import b1, f8, i8, u2
+from numba import b1, f8, i4, i8, u2
 
 from slamcli.config.options import GridConfig, SensorConfig
 from slamcli.errors import SlamError
 from slamcli.geometry.camera import Camera
 from slamcli.jit.kernel import kernel
-from slamcli.navigation.grid_evidence import SLICES, View, look
+from slamcli.navigation import hanging
+from slamcli.navigation.grid_evidence import NOT_SEEN, SEEN, SLICES, View, look
 from slamcli.schema import Grid
 
 MAX_CELLS = 1 << 25  # 290 m x 290 m at 0.05 m: some 600 MB of work arrays
 MAX_WINDOW = 4000  # cells within reach of one view: 110 MB
 DEEPEST = 1.0  # [m] how far something that hangs may go on behind the face that was seen
+FAR_EDGE = 0.3  # [m] before a hole's far edge in which the wall below it ends the lines of sight
+TOP_SLICE = 1 << (SLICES - 1)
+INSIDE = 0.9  # P(F) of a cell that was never seen but must lie within something that hangs
 OCCUPIED, FREE, UNKNOWN = 1, 0, -1
 
 
@@ -32,7 +37,7 @@ def build_grid(frames: Iterable[tuple[np.ndarray, np.ndarray]], camera: Camera, 
     """
     check(settings)
     rays = np.ascontiguousarray(camera.rays)
-    return fuse([look(depth, rays, T_lk, settings=settings, sensor=sensor) for depth, T_lk in frames], settings=settings)
+    return fuse((look(depth, rays, T_lk, settings=settings, sensor=sensor) for depth, T_lk in frames), settings=settings)
 
 
 def check(settings: GridConfig) -> None:
@@ -62,24 +67,99 @@ def spaced(T_lc: np.ndarray, *, metres: float, degrees: float) -> np.ndarray:
     return np.array(chosen, dtype=np.int64)
 
 
-def fuse(views: list[View], *, settings: GridConfig) -> Grid:
+def fuse(views: Iterable[View], *, settings: GridConfig) -> Grid:
     """Fuse the views, in order, to one grid."""
+    views, crossings = _without_crossings(views, settings.resolution)
     low, shape = extent(views, settings.resolution)
-    standing = _with_neighbours(_standing(views, low, shape, settings))
+    standing, is_hole = _standing(views, low, shape, settings), _holes(views, low, shape, settings.resolution)
+    is_open, outline = crossings.open_slices(low, shape), _with_neighbours(standing)
     p_empty = np.full(shape, np.nan, dtype=np.float32)
-    n_seen = np.zeros(shape, dtype=np.int32)
+    n_seen, n_under, n_top = (np.zeros(shape, dtype=np.int32) for _ in range(3))
+    sights = [_sight(view, low, settings) for view in views]
+    hangs, nothing = np.zeros(shape, dtype=np.uint16), np.zeros(shape, dtype=np.int32)
+    for view, sight in zip(views, sights, strict=True):
+        is_floor = (view.floor != NOT_SEEN) & ~is_hole[sight[:2]]
+        is_free = is_floor.copy()
+        _drop_hidden(is_free, outline, is_open, hangs, nothing, nothing, *sight)
+        is_under = is_floor & ~is_free
+        n_under[sight[0][is_under], sight[1][is_under]] += 1
+        n_top[sight[0][view.is_top], sight[1][view.is_top]] += 1
+    things = hanging.find(standing & hangs, widest=DEEPEST / settings.resolution)
     update = paper_update if settings.update == "paper" else evidence_update
-    for view in views:
-        rows, columns = view.cell[:, 1] - low[1], view.cell[:, 0] - low[0]
-        x, y = view.camera[:2] / settings.resolution - low
-        band, reach = (settings.band_low, settings.band_high), DEEPEST / settings.resolution
-        is_free = view.is_floor.copy()
-        _drop_hidden(is_free, standing, rows, columns, x, y, view.camera[2], *band, reach)
+    for view, sight in zip(views, sights, strict=True):
+        is_free = (view.floor != NOT_SEEN) & ~is_hole[sight[:2]]
+        _drop_hidden(is_free, outline, is_open, hangs, things.face, things.around, *sight)
         told = is_free | (view.n_band >= settings.n_low)
-        update(p_empty, n_seen, rows[told], columns[told], view.n_band[told], settings)
+        update(p_empty, n_seen, sight[0][told], sight[1][told], view.n_band[told], settings)
     p_occupied = (1.0 - p_empty).astype(np.float32)
     state = decide(p_occupied, low=settings.m_low, high=settings.m_high)
+    body = hanging.bodies(things, is_under=(n_under >= 2) & (state == UNKNOWN), is_top=n_top > 0)
+    p_occupied[body], n_seen[body], state[body] = INSIDE, n_under[body], OCCUPIED
     return Grid(p_occupied, n_seen, state, origin=low * settings.resolution, resolution=np.array(settings.resolution))
+
+
+def _sight(view: View, low: np.ndarray, settings: GridConfig) -> tuple:
+    """Give a view's cells and camera as `_drop_hidden` takes them: rows, columns, x, y [cells], z, band and reach."""
+    x, y = view.camera[:2] / settings.resolution - low
+    cells = view.cell[:, 1] - low[1], view.cell[:, 0] - low[0]
+    return *cells, x, y, view.camera[2], settings.band_low, settings.band_high, DEEPEST / settings.resolution
+
+
+def _without_crossings(views: Iterable[View], resolution: float) -> tuple[list[View], "Crossings"]:
+    """Add up the views' lines of sight and give the views without them: they are most of what a view holds."""
+    crossings, kept = Crossings(resolution), []
+    for view in views:
+        crossings.add(view.open_cell, view.open_slices)
+        kept.append(replace(view, open_cell=view.open_cell[:0], open_slices=view.open_slices[:0]))
+    return kept, crossings
+
+
+class Crossings:
+    """Which slices of which cells lines of sight crossed: in any view, and in two at least."""
+
+    def __init__(self, resolution: float) -> None:
+        """Start without any; `resolution` [m] is for what is said of a grid too large."""
+        self._resolution = resolution
+        self._low = np.zeros(2, dtype=np.int64)
+        self._once = self._twice = np.zeros((0, 0), dtype=np.uint16)
+
+    def add(self, cell: np.ndarray, slices: np.ndarray) -> None:
+        """Add one view's cells (N, 2), each once, and their slices (N,) uint16."""
+        if not len(cell):
+            return
+        self._grow(cell.min(axis=0).astype(np.int64), cell.max(axis=0).astype(np.int64) + 1)
+        rows, columns = cell[:, 1] - self._low[1], cell[:, 0] - self._low[0]
+        self._twice[rows, columns] |= self._once[rows, columns] & slices
+        self._once[rows, columns] |= slices
+
+    def open_slices(self, low: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+        """Cut out, for a grid, the slices (H, W) uint16 that two views or more saw through."""
+        out = np.zeros(shape, dtype=np.uint16)
+        rows, columns = self._twice.shape
+        if self._twice.size:
+            first = np.maximum(low, self._low)
+            last = np.minimum(low + shape[::-1], self._low + [columns, rows])
+            if (first < last).all():
+                a, b, c, d = first - low, last - low, first - self._low, last - self._low
+                out[a[1] : b[1], a[0] : b[0]] = self._twice[c[1] : d[1], c[0] : d[0]]
+        return out
+
+    def _grow(self, low: np.ndarray, high: np.ndarray) -> None:
+        size = np.array(self._once.shape[::-1])
+        if self._once.size:
+            if (low >= self._low).all() and (high <= self._low + size).all():
+                return
+            # Half as much again on the side that lacks room: growth costs little then, however long the drive.
+            room = size // 2 * ((low < self._low) | (high > self._low + size))
+            low = np.where(low < self._low, np.minimum(low, self._low - room), self._low)
+            high = np.where(high > self._low + size, np.maximum(high, self._low + size + room), self._low + size)
+        columns, rows = (int(n) for n in high - low)
+        check_size(rows, columns, self._resolution)
+        at = (self._low - low) if self._once.size else np.zeros(2, dtype=np.int64)
+        window = (slice(at[1], at[1] + size[1]), slice(at[0], at[0] + size[0]))
+        once, twice = (np.zeros((rows, columns), dtype=np.uint16) for _ in range(2))
+        once[window], twice[window] = self._once, self._twice
+        self._low, self._once, self._twice = low, once, twice
 
 
 def _standing(views: list[View], low: np.ndarray, shape: tuple[int, int], settings: GridConfig) -> np.ndarray:
@@ -89,6 +169,26 @@ def _standing(views: list[View], low: np.ndarray, shape: tuple[int, int], settin
         is_hit = view.n_band >= settings.n_low
         standing[view.cell[is_hit, 1] - low[1], view.cell[is_hit, 0] - low[0]] |= view.slices[is_hit]  # a cell is in a view once
     return standing
+
+
+def _holes(views: list[View], low: np.ndarray, shape: tuple[int, int], resolution: float) -> np.ndarray:
+    """Say which cells (H, W) are holes in the floor: seen through in two views, and in half as many as saw a floor there.
+
+    Lines of sight end so close below a hole's far edge that they tell of no depth; there, and only there, a line that passes below the
+    band does not tell of a floor. A reflecting floor is taken for a hole: neither is fit to drive on, nor an obstacle.
+    """
+    import cv2
+
+    n_hole, n_floor = (np.zeros(shape, dtype=np.int32) for _ in range(2))
+    for view in views:
+        for count, has in ((n_hole, view.is_hole), (n_floor, view.floor == SEEN)):
+            count[view.cell[has, 1] - low[1], view.cell[has, 0] - low[0]] += 1
+    is_hole = (n_hole >= 2) & (2 * n_hole >= n_floor)
+    if not is_hole.any():
+        return is_hole
+    reach = int(np.ceil(FAR_EDGE / resolution))
+    near = cv2.dilate(is_hole.astype(np.uint8), np.ones((2 * reach + 1,) * 2, np.uint8)) > 0
+    return is_hole | (near & (n_floor == 0))
 
 
 def _with_neighbours(standing: np.ndarray) -> np.ndarray:
@@ -122,6 +222,10 @@ def check_size(rows: int, columns: int, resolution: float) -> None:
 def _drop_hidden(
     is_free: b1[::1],
     standing: u2[:, ::1],
+    is_open: u2[:, ::1],
+    hangs: u2[:, ::1],
+    face: i4[:, ::1],
+    around: i4[:, ::1],
     rows: i8[::1],
     columns: i8[::1],
     camera_x: f8,
@@ -135,7 +239,8 @@ def _drop_hidden(
 
     It passes under something in a cell where slices above the line are filled, while those around the line are not: a line that goes
     through filled slices only grazes the cell's corner, or what stood there has moved. A line may pass over a low box: what is above
-    the line beyond the box was open to view.
+    the line beyond the box was open to view. What hangs does not reach as far as the floor's cell if lines of sight crossed that cell at
+    its heights, `is_open` (H, W), or if it is the face of a thing (H, W) of known outline that is not `around` it. The slices that hide are added to `hangs` (H, W).
     """
     for n in range(len(rows)):
         if not is_free[n]:
@@ -153,9 +258,16 @@ def _drop_hidden(
                 break
             if standing[i, j]:
                 at = int(SLICES * (height - low) / (high - low)) if height > low else 0
-                around = (31 << at) >> 2  # two slices to either side
-                if (standing[i, j] >> (at + 3)) and not (standing[i, j] & around):
+                beside = (31 << at) >> 2  # two slices to either side
+                above = (standing[i, j] >> (at + 3)) << (at + 3)
+                if face[i, j] and around[rows[n], columns[n]] != face[i, j]:
+                    continue
+                # The lowest and the highest slice may be filled in part; what is above the band goes on.
+                core = above & (above << 1) & ((above >> 1) | (above & TOP_SLICE))
+                is_passed = core != 0 and not (core & ~is_open[rows[n], columns[n]])
+                if above and not is_passed and not (standing[i, j] & beside):
                     is_free[n] = False
+                    hangs[i, j] |= np.uint16(above)
                     break
 
 

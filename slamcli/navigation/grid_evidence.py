@@ -1,4 +1,4 @@
-"""What single depth images tell about the cells of the grid: points in the robot's height band, floor, and lines of sight just above it."""
+"""What one depth image tells about the cells of the grid: points in the robot's height band, floor or its absence, and open lines of sight."""
 
 import math
 from dataclasses import dataclass
@@ -12,6 +12,10 @@ from slamcli.jit.kernel import kernel
 
 SLICES = 16  # of the band's height, one bit each
 ALL_SLICES = (1 << SLICES) - 1
+NOT_SEEN, PASSED, SEEN = 0, 1, 2  # of a cell's floor: PASSED is a line of sight below the band, which ends on the floor farther on
+HOLE_POINTS = 2  # readings through the floor's plane that make a cell a hole: one may be a slip
+OPEN_STRIDE = 2  # open lines of sight are followed at every so many of the pixels whose points are sorted
+TOP_REACH = 0.3  # [m] above the band: what is seen there from above may be the top of something that reaches into the band
 
 
 @dataclass(frozen=True)
@@ -21,8 +25,12 @@ class View:
     cell: np.ndarray  # (N, 2) int32, column (x) and row (y) counted from level x = y = 0
     n_band: np.ndarray  # (N,) int32, points in the band
     slices: np.ndarray  # (N,) uint16, bits: height slices of the band with points
-    is_floor: np.ndarray  # (N,) bool, the floor was seen, or a line of sight passed below the band
+    floor: np.ndarray  # (N,) uint8, NOT_SEEN, PASSED or SEEN
+    is_hole: np.ndarray  # (N,) bool, lines of sight went down through the floor's plane
+    is_top: np.ndarray  # (N,) bool, a level surface just above the band was seen from above
     camera: np.ndarray  # (3,) m, level frame
+    open_cell: np.ndarray  # (O, 2) int32, cells that lines of sight crossed within the band
+    open_slices: np.ndarray  # (O,) uint16, bits: the slices they crossed
 
 
 def look(depth: np.ndarray, rays: np.ndarray, T_lk: np.ndarray, *, settings: GridConfig, sensor: SensorConfig) -> View:
@@ -38,21 +46,29 @@ def look(depth: np.ndarray, rays: np.ndarray, T_lk: np.ndarray, *, settings: Gri
     side = 2 * half + 1
     n_band = np.zeros((side, side), dtype=np.int32)
     slices = np.zeros((side, side), dtype=np.uint16)
-    floor = np.zeros((side, side), dtype=np.uint8)
+    floor, hole, top = (np.zeros((side, side), dtype=np.uint8) for _ in range(3))
+    crossed = np.zeros((side, side), dtype=np.uint16)
     depth, T_lk = np.ascontiguousarray(depth, dtype=np.float32), np.ascontiguousarray(T_lk, dtype=np.float64)
-    _sort_points(
-        depth, rays, T_lk, centre - half, settings.stride, cell, settings.min_range, settings.max_range, settings.band_low, settings.band_high,
-        sensor.depth_noise_base, sensor.depth_noise_quadratic, n_band, slices, floor,
-    )  # fmt: skip
+    of_view = (depth, rays, T_lk, centre - half)
+    of_settings = (cell, settings.min_range, settings.max_range, settings.band_low, settings.band_high)
+    of_sensor = (sensor.depth_noise_base, sensor.depth_noise_quadratic)
+    _sort_points(*of_view, settings.stride, *of_settings, settings.drop, *of_sensor, n_band, slices, floor, hole, top)
+    _cross(*of_view, OPEN_STRIDE * settings.stride, *of_settings, *of_sensor, crossed)
     if settings.extend_down:
         _extend_down(depth, rays, T_lk, centre - half, settings, n_band, slices)
-    rows, columns = np.nonzero((n_band > 0) | (floor > 0))
+    first = centre.astype(np.int64) - half
+    rows, columns = np.nonzero((n_band > 0) | (floor > 0) | (hole >= HOLE_POINTS) | (top > 0))
+    open_rows, open_columns = np.nonzero(crossed)
     return View(
-        cell=np.stack([columns + int(centre[0]) - half, rows + int(centre[1]) - half], axis=1).astype(np.int32),
+        cell=np.stack([columns + first[0], rows + first[1]], axis=1).astype(np.int32),
         n_band=n_band[rows, columns],
         slices=slices[rows, columns],
-        is_floor=floor[rows, columns] > 0,
+        floor=floor[rows, columns],
+        is_hole=hole[rows, columns] >= HOLE_POINTS,
+        is_top=top[rows, columns] > 0,
         camera=T_lk[:3, 3].copy(),
+        open_cell=np.stack([open_columns + first[0], open_rows + first[1]], axis=1).astype(np.int32),
+        open_slices=crossed[open_rows, open_columns],
     )
 
 
@@ -68,36 +84,51 @@ def _sort_points(
     far: f8,
     low: f8,
     high: f8,
+    drop: f8,
     noise_base: f8,
     noise_quadratic: f8,
     n_band: i4[:, ::1],
     slices: u2[:, ::1],
     floor: u1[:, ::1],
+    hole: u1[:, ::1],
+    top: u1[:, ::1],
 ):
-    """Count band points per cell and mark cells whose floor is seen or over which a line of sight passes below the band.
+    """Count band points per cell; mark cells whose floor is seen or over which a line of sight passes below the band, holes, and tops.
 
-    Points closer to the floor than `low` plus twice their height's noise are the floor's; the noise of a height is the depth's noise
+    A line of sight that ends deeper than `drop` below the floor makes the cell in which it crosses the floor's plane a hole; the cells
+    beyond, over which it runs below that plane, may have a floor if it was a reflection. Points closer to the floor than `low` plus twice their height's noise are the floor's; the noise of a height is the depth's noise
     times the slope of the ray, small at the flat angles under which a robot sees the far floor.
     """
     side = n_band.shape[0]
     for v in range(stride // 2, depth.shape[0], stride):
         for u in range(stride // 2, depth.shape[1], stride):
             z = depth[v, u]
-            if not (z >= near and z <= far):
+            if not z >= near:
                 continue
             rx, ry = rays[v, u, 0], rays[v, u, 1]
             dx = T[0, 0] * rx + T[0, 1] * ry + T[0, 2]
             dy = T[1, 0] * rx + T[1, 1] * ry + T[1, 2]
             dz = T[2, 0] * rx + T[2, 1] * ry + T[2, 2]
             height = T[2, 3] + z * dz
-            if height >= high:
+            noise = abs(dz) * (noise_base + noise_quadratic * (z - 0.4) * (z - 0.4))
+            if height < -drop - 2.0 * noise and T[2, 3] > 0.0:
+                at = T[2, 3] / -dz
+                j, i = math.floor((T[0, 3] + at * dx) / cell - corner[0]), math.floor((T[1, 3] + at * dy) / cell - corner[1])
+                if at <= far and 0 <= i < side and 0 <= j < side and hole[i, j] < 255:
+                    hole[i, j] += 1
+                continue
+            if z > far or height >= high + TOP_REACH:
                 continue
             x, y = (T[0, 3] + z * dx) / cell - corner[0], (T[1, 3] + z * dy) / cell - corner[1]
             i, j = math.floor(y), math.floor(x)
             if not (0 <= i < side and 0 <= j < side):
                 continue
-            noise = abs(dz) * (noise_base + noise_quadratic * (z - 0.4) * (z - 0.4))
-            if height >= low + 2.0 * noise:
+            if height >= high:
+                if dz < 0.0 and v >= stride:
+                    dz2 = T[2, 0] * rays[v - stride, u, 0] + T[2, 1] * rays[v - stride, u, 1] + T[2, 2]
+                    if abs(T[2, 3] + depth[v - stride, u] * dz2 - height) < 0.5 * z * (dz2 - dz):
+                        top[i, j] = 1
+            elif height >= low + 2.0 * noise:
                 n_band[i, j] += 1
                 slices[i, j] |= np.uint16(1 << int(SLICES * (height - low) / (high - low)))
             elif height > -low - 2.0 * noise and dz < 0.0 and v >= stride:
@@ -106,7 +137,7 @@ def _sort_points(
                 dz2 = T[2, 0] * rays[v - stride, u, 0] + T[2, 1] * rays[v - stride, u, 1] + T[2, 2]
                 if not (abs(T[2, 3] + z2 * dz2 - height) < 0.5 * z * (dz2 - dz)):
                     continue
-                floor[i, j] = 1
+                floor[i, j] = SEEN
                 # Back along the ray, as long as it is below the band.
                 rise = low - height if height > 0.0 else low
                 if rise > T[2, 3] - height:
@@ -116,8 +147,64 @@ def _sort_points(
                 for s in range(1, steps + 1):
                     back = reach * s / (steps + 1)
                     i2, j2 = math.floor(y - back * dy / cell), math.floor(x - back * dx / cell)
-                    if 0 <= i2 < side and 0 <= j2 < side:
-                        floor[i2, j2] = 1
+                    if 0 <= i2 < side and 0 <= j2 < side and floor[i2, j2] == NOT_SEEN:
+                        floor[i2, j2] = PASSED
+
+
+@kernel
+def _cross(
+    depth: f4[:, ::1],
+    rays: f4[:, :, ::1],
+    T: f8[:, ::1],
+    corner: f8[::1],
+    stride: i8,
+    cell: f8,
+    near: f8,
+    far: f8,
+    low: f8,
+    high: f8,
+    noise_base: f8,
+    noise_quadratic: f8,
+    crossed: u2[:, ::1],
+):
+    """Mark, as bits per cell, the slices of the band that lines of sight cross: up to a cell and the noise before their end, or to `far`.
+
+    A reading beyond `far` is too inexact to be a point, but tells that nothing is nearer.
+    """
+    side = crossed.shape[0]
+    for v in range(stride // 2, depth.shape[0], stride):
+        for u in range(stride // 2, depth.shape[1], stride):
+            z = depth[v, u]
+            if not z >= near:
+                continue
+            rx, ry = rays[v, u, 0], rays[v, u, 1]
+            dx = T[0, 0] * rx + T[0, 1] * ry + T[0, 2]
+            dy = T[1, 0] * rx + T[1, 1] * ry + T[1, 2]
+            dz = T[2, 0] * rx + T[2, 1] * ry + T[2, 2]
+            first, last = near, z - 2.0 * (noise_base + noise_quadratic * (z - 0.4) * (z - 0.4)) - cell
+            if last > far:
+                last = far
+            if abs(dz) > 1e-9:
+                a, b = (low - T[2, 3]) / dz, (high - T[2, 3]) / dz
+                if a > b:
+                    a, b = b, a
+                if a > first:
+                    first = a
+                if b < last:
+                    last = b
+            elif not low <= T[2, 3] < high:
+                continue
+            if not first < last:
+                continue
+            along = abs(dx) if abs(dx) > abs(dy) else abs(dy)
+            steps = math.ceil((last - first) * along / cell)
+            for s in range(steps + 1):
+                t = first + (last - first) * (s + 0.5) / (steps + 1)
+                i, j = math.floor((T[1, 3] + t * dy) / cell - corner[1]), math.floor((T[0, 3] + t * dx) / cell - corner[0])
+                if 0 <= i < side and 0 <= j < side:
+                    at = int(SLICES * (T[2, 3] + t * dz - low) / (high - low))
+                    if 0 <= at < SLICES:
+                        crossed[i, j] |= np.uint16(1 << at)
 
 
 def _extend_down(

@@ -1,7 +1,7 @@
 """densify: the key frames' depth images to one coloured cloud in the level frame."""
 
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +10,7 @@ import numpy as np
 from slamcli.artifacts import save
 from slamcli.config.options import Config, DensifyConfig, SensorConfig
 from slamcli.datasets import Dataset
-from slamcli.dense import voxel_cloud
+from slamcli.dense import exposure, voxel_cloud
 from slamcli.depth import oriented_points
 from slamcli.formats.cloud import write_ply, write_ply_mesh
 from slamcli.geometry.camera import Camera
@@ -20,6 +20,7 @@ from slamcli.stages.depth_frames import PosedFrame, depth_poses, read_depth
 
 SAMPLES_APART = 0.75  # voxels from sample to sample of a near surface: denser ones gain nothing
 FIRST_CAMERA = np.eye(4)  # the world is its frame; the level frame's origin is below it
+COLOUR_STRIDE = 4  # [px] of the samples that tell exposures
 GROUND_FRAMES = 40  # key frames, evenly spread, that are searched for the floor; more do not move it
 
 
@@ -28,6 +29,11 @@ def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
     camera, option = inputs.camera("loop"), cfg.densify
     poses = depth_poses(inputs)
     model_w = _model(camera, option)
+    gains = (
+        colour_gains(inputs.dataset, camera, tools.progress(poses, "colours"), cfg.sensor, option, workers=tools.workers)
+        if option.even_colours
+        else {}
+    )
     n_used = 0
 
     def frames() -> Iterator[tuple[np.ndarray, np.ndarray]]:
@@ -36,7 +42,7 @@ def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
         every = -(-len(poses) // GROUND_FRAMES)
         timeline = tools.progress(poses, "densify")
         for view in views(inputs.dataset, camera, timeline, cfg.sensor, option, workers=tools.workers, warn=tools.warn):
-            model_w.add(view.seen, view.rgb, view.T_wk)
+            model_w.add(view.seen, view.evened(gains), view.T_wk)
             n_used += 1
             if n_used % every == 0:
                 yield view.depth, view.T_wk
@@ -75,10 +81,31 @@ def _model(camera: Camera, option: DensifyConfig) -> Any:
 class View:
     """What one key frame sees."""
 
+    frame: int
     T_wk: np.ndarray  # (4, 4) camera to world
     depth: np.ndarray  # (H, W) float32 [m]
     seen: oriented_points.Surface
     rgb: np.ndarray  # (H, W, 3) uint8
+
+    def evened(self, gains: Mapping[int, np.ndarray]) -> np.ndarray:
+        """Return the colours (H, W, 3) uint8 under this frame's gains, as they are where it has none."""
+        return exposure.evened(self.rgb, gains[self.frame]) if self.frame in gains else self.rgb
+
+
+def colour_gains(
+    dataset: Dataset, camera: Camera, poses: Iterable[PosedFrame], sensor: SensorConfig, option: DensifyConfig, *, workers: int = 1
+) -> dict[int, np.ndarray]:
+    """Find the gains (3,) of each key frame's colours; frames that cannot be read have none."""
+    coarse = replace(option, method="voxel", stride=COLOUR_STRIDE)
+    frame: list[int] = []
+
+    def seen() -> Iterator[tuple[oriented_points.Surface, np.ndarray, np.ndarray]]:
+        for view in views(dataset, camera, poses, sensor, coarse, workers=workers):
+            frame.append(view.frame)
+            yield view.seen, view.rgb, view.T_wk
+
+    gains = exposure.frame_gains(seen())
+    return dict(zip(frame, gains, strict=True))
 
 
 def views(
@@ -104,6 +131,6 @@ def views(
             depth_min=sensor.depth_min,
             depth_max=min(sensor.depth_max, option.depth_max),
         )
-        return View(T_wk, depth, seen, dataset.rgb(frame))
+        return View(frame, T_wk, depth, seen, dataset.rgb(frame))
 
     return read_depth(dataset, camera, poses, look, workers=workers, warn=warn)

@@ -1,5 +1,6 @@
 """grid2d: the 2-D navigation grid, from the depth of well-spaced frames or from the octree."""
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -7,14 +8,19 @@ import numpy as np
 
 from slamcli.artifacts import save
 from slamcli.config.options import Config
+from slamcli.depth import icp
 from slamcli.formats import grid_map, octomap
-from slamcli.navigation import grid
+from slamcli.formats.mask import read_mask
+from slamcli.geometry.camera import Camera
+from slamcli.navigation import grid, own_body
 from slamcli.navigation.driven import mark_driven
 from slamcli.navigation.grid_evidence import View, look
 from slamcli.navigation.robot_pose import planar_pose
-from slamcli.schema import Features, Grid, Ground, Map, Tracks, frame_poses
+from slamcli.schema import CoarseDepth, Features, Grid, Ground, Map, Tracks, frame_poses
 from slamcli.stages.contract import Inputs, Summary, Tools
-from slamcli.stages.depth_frames import depth_poses, read_depth
+from slamcli.stages.depth_frames import PosedFrame, depth_poses, read_depth
+
+BODY_VIEWS = 60  # spread over the drive, in which the robot's own body is looked for
 
 
 def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
@@ -50,9 +56,51 @@ def _from_depth(inputs: Inputs, T_lw: np.ndarray, cfg: Config, tools: Tools) -> 
     poses = [(frame, T_lw @ T_wd) for frame, T_wd in depth_poses(inputs, frames="all") if has_depth[frame]]
     chosen = grid.spaced(np.array([T_ld for _, T_ld in poses]).reshape(-1, 4, 4), metres=option.spacing, degrees=option.spacing_deg)
 
+    is_left_out = _left_out(inputs, [poses[row] for row in chosen.tolist()], cfg, tools)
+
     def look_at(frame: int, depth: np.ndarray, T_ld: np.ndarray) -> View:
+        if is_left_out is not None:
+            depth = np.where(is_left_out, np.float32(np.nan), depth)
         return look(depth, rays, T_ld, settings=option, sensor=cfg.sensor)
 
     spaced = tools.progress([poses[row] for row in chosen.tolist()], "grid2d")
-    views = list(read_depth(inputs.dataset, camera, spaced, look_at, workers=tools.workers, warn=tools.warn))
-    return grid.fuse(views, settings=option), len(views)
+    n_views = 0
+
+    def views() -> Iterator[View]:
+        """Hand each view on at once: together their lines of sight would fill much memory."""
+        nonlocal n_views
+        for view in read_depth(inputs.dataset, camera, spaced, look_at, workers=tools.workers, warn=tools.warn):
+            n_views += 1
+            yield view
+
+    return grid.fuse(views(), settings=option), n_views
+
+
+def _left_out(inputs: Inputs, poses: list[PosedFrame], cfg: Config, tools: Tools) -> np.ndarray | None:
+    """Find the pixels (H, W) whose depth is not used: those that the user masks and those that show the robot itself; None = all are."""
+    camera = inputs.camera("loop")
+    shape = camera.height, camera.width
+    out = np.zeros(shape, dtype=bool)
+    if cfg.grid2d.mask:
+        out |= read_mask(Path(cfg.grid2d.mask), shape)
+    if cfg.grid2d.own_body:
+        body = _own_body(inputs, poses, camera, cfg.grid2d.band_low)
+        if body.any():
+            tools.warn(f"{body.mean():.1%} of the picture shows the same near depth in every view, as the robot's own body does: left out")
+        out |= body
+    return out if out.any() else None
+
+
+def _own_body(inputs: Inputs, poses: list[PosedFrame], camera: Camera, band_low: float) -> np.ndarray:
+    chosen = [poses[k] for k in np.unique(np.linspace(0, len(poses) - 1, min(len(poses), BODY_VIEWS)).astype(int))] if poses else []
+    coarse = inputs.load(CoarseDepth, "extract").coarse_depth
+    units = np.stack([coarse[frame] for frame, _ in chosen]) if chosen else np.zeros((0, *coarse.shape[1:]), np.uint16)
+    if not units.size:
+        return np.zeros((camera.height, camera.width), dtype=bool)
+    depth = np.where(units > 0, units * icp.UNIT, np.nan)
+    T_lc = np.stack([T for _, T in chosen])
+    side = camera.height // depth.shape[1]
+    rays = camera.rays[side // 2 :: side, side // 2 :: side][: depth.shape[1], : depth.shape[2]].astype(np.float64)
+    slope = np.einsum("nk,vuk->nvu", T_lc[:, 2, :2], rays) + T_lc[:, 2, 2, None, None]
+    blocks = own_body.fixed_parts(depth, T_lc[:, 2, 3, None, None] + depth * slope, T_lc, band_low=band_low)
+    return own_body.to_pixels(blocks, (camera.height, camera.width))

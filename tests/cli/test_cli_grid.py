@@ -10,12 +10,13 @@ from boxroom import HANGING, KINECT, kinect_noise, look_along, render, round_tri
 
 from slamcli import artifacts
 from slamcli.config.options import Config, GridConfig
+from slamcli.depth import icp
 from slamcli.errors import BadFrame
 from slamcli.formats import grid_map, octomap
 from slamcli.geometry import se3
 from slamcli.runs import pipeline, placement
 from slamcli.runs.run_directory import RunDir
-from slamcli.schema import Features, Grid, Ground, Map, Timing, Tracks
+from slamcli.schema import CoarseDepth, Features, Grid, Ground, Map, Timing, Tracks
 from slamcli.stages import grid2d, stage_named
 
 
@@ -197,6 +198,7 @@ class Inputs:
                 np.empty((0, 32), np.uint8),
                 np.array(1.2),
             ),
+            CoarseDepth: CoarseDepth(np.zeros((n, 0, 0), np.uint16)),
             Ground: Ground(T_lw, plane, np.array(0.01), np.array(0.9), np.array(is_found)),
             Timing: Timing(np.array(0.0), np.array(0.0), np.array(0.0), np.zeros((n, 6))),
             Tracks: Tracks(np.where(lost, -1, np.arange(n)).astype(np.int32), T_kc, np.ones(n, np.uint8), np.full(n, 99, np.int32)),
@@ -240,6 +242,26 @@ def test_the_stage_writes_grid_and_map_alike(tmp_path):
     assert tools.warnings == ["depth/3.png: cannot be decoded"]
     row, column = np.floor((np.array(HANGING)[:, 1::-1].mean(axis=0) - made.origin[::-1]) / 0.05).astype(int)
     assert made.state[row, column] != 0
+
+
+def test_the_stage_leaves_out_the_robots_own_body_and_says_so(tmp_path):
+    T = round_trip(step=0.4, turn=0.3)
+    inputs = Inputs(tmp_path, T)
+    coarse = np.zeros((len(T), 15, 20), np.uint16)
+    coarse[:, 13:, 6:14] = round(0.6 / icp.UNIT)
+    inputs._values[CoarseDepth] = CoarseDepth(coarse)
+    _, _, tools = run_stage(tmp_path, inputs)
+    assert any("own body" in warning for warning in tools.warnings)
+    (tmp_path / "again").mkdir()
+    _, _, tools = run_stage(tmp_path / "again", inputs, own_body=False)
+    assert not any("own body" in warning for warning in tools.warnings)
+
+
+def test_the_stage_leaves_out_what_a_mask_says(tmp_path):
+    inputs = Inputs(tmp_path, round_trip(step=0.4, turn=0.3))
+    cv2.imwrite(str(tmp_path / "all.png"), np.full((120, 160), 255, np.uint8))
+    summary, _, _ = run_stage(tmp_path, inputs, mask=str(tmp_path / "all.png"))
+    assert summary["free"] == summary["occupied"] == 0
 
 
 def test_the_stage_warns_when_no_floor_was_found_or_seen(tmp_path):

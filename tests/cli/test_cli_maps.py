@@ -56,6 +56,27 @@ def test_export_mesh_makes_a_surface_of_the_level_frame(slamcli: Callable, known
     assert np.median(KDTree(mesh).query(points)[0]) < 0.04
 
 
+def test_a_mesh_of_fewer_triangles_is_the_same_surface(slamcli: Callable, known: RunDir, tmp_path: Path) -> None:
+    trimesh = pytest.importorskip("trimesh")
+    options = ("-r", known.path, "--voxel", 0.05)
+    for name, more in (
+        ("all.ply", ()),
+        ("few.ply", ("--triangles", 2000)),
+        ("few.glb", ("--triangles", 2000)),
+        ("few.obj", ("--triangles", 2000)),
+    ):
+        assert slamcli("export-mesh", tmp_path / name, *options, *more).exit_code == 0
+    whole, few = (trimesh.load(tmp_path / name, process=False) for name in ("all.ply", "few.ply"))
+    assert 1000 < len(few.faces) <= 2000 < len(whole.faces)
+    assert few.area == pytest.approx(whole.area, rel=0.1)
+    for name in ("few.glb", "few.obj"):
+        read = trimesh.load(tmp_path / name, process=False)
+        read = read.to_geometry() if isinstance(read, trimesh.Scene) else read
+        assert len(read.faces) == len(few.faces) and read.area == pytest.approx(few.area, rel=1e-3)
+    result = slamcli("export-mesh", tmp_path / "none.ply", *options, "--min-area", 1e6)
+    assert result.exit_code == 1 and "--min-area" in result.stderr
+
+
 @pytest.mark.parametrize("what", ["cloud", "octree"])
 def test_render_draws_the_map(slamcli: Callable, known: RunDir, what: str, tmp_path: Path) -> None:
     out = tmp_path / "picture.png"
@@ -68,10 +89,10 @@ def test_render_draws_the_map(slamcli: Callable, known: RunDir, what: str, tmp_p
 @pytest.mark.parametrize(
     ("command", "message"),
     [
-        (("export-cloud", "cloud.xyz"), "must end in .ply or .pcd"),
+        (("export-cloud", "cloud.xyz"), "must end in .ply or .pcd or .las or .laz"),
         (("export-octree", "map.png"), "must end in .bt or .ot"),
         (("export-octree", "map.bt", "--colour"), "no room for colours"),
-        (("export-mesh", "mesh.obj"), "must end in .ply"),
+        (("export-mesh", "mesh.stl"), "must end in .glb or .obj or .ply"),
         (("render", "picture.gif"), "must end in .png or .jpg"),
         (("export-octree", "no/such/folder/map.bt"), "its folder is not there"),
     ],

@@ -14,7 +14,7 @@ from slamcli.navigation import grid, grid_evidence
 from slamcli.navigation.grid import FREE, OCCUPIED, UNKNOWN, build_grid, decide, fuse, view_probability
 from slamcli.navigation.grid_evidence import View
 
-SETTINGS = GridConfig(stride=1, min_range=0.5)  # of images a quarter as wide as a Kinect's
+SETTINGS = GridConfig(stride=1, min_range=0.5, n_low=3, n_high=8)  # of images a quarter as wide as a Kinect's
 SENSOR = SensorConfig()
 
 
@@ -127,19 +127,39 @@ def test_an_upright_surface_that_leaves_the_picture_downwards_reaches_the_floor(
     assert (cells(build(T, boxes=(shelf,)), shelf) != OCCUPIED).all()
 
 
-def test_band_points_and_floor_match_their_slow_twin():
+def test_band_points_floor_holes_and_tops_match_their_slow_twin():
     rng = np.random.default_rng(3)
+    # From below a level frame that is too high, the floor is a hole and the table reaches just above the band.
+    for height, lift in ((0.6, 0.0), (1.1, -0.2)):
+        T = look_along([3.9, 0.9, height], 0.7, 0.3)
+        depth = kinect_noise(render(T), rng)
+        corner, side = np.floor(T[:2, 3] / 0.05) - 85, 171
+        T[2, 3] += lift
+        args = (corner, 3, 0.05, 0.5, 4.0, 0.05, 0.5, 0.08, 0.0012, 0.0019)
+        n_band, layers = np.zeros((side, side), np.int32), np.zeros((side, side), np.uint16)
+        floor, hole, top = (np.zeros((side, side), np.uint8) for _ in range(3))
+        grid_evidence._sort_points(depth, KINECT.rays, T, *args, n_band, layers, floor, hole, top)
+        expected = naive.sorted_points(depth, KINECT.rays, T, *args, side)
+        assert n_band.sum() > 100 and (floor.sum() > 100 if lift == 0.0 else min(hole.sum(), top.sum()) > 50)
+        np.testing.assert_array_equal(n_band, expected[0])
+        np.testing.assert_array_equal(layers, expected[1])
+        np.testing.assert_array_equal(floor, expected[2])
+        np.testing.assert_array_equal(hole, expected[3])
+        np.testing.assert_array_equal(top > 0, expected[4])
+
+
+def test_crossed_slices_match_their_slow_twin():
     T = look_along([1.0, 0.9, 0.6], 0.7, 0.3)
-    depth = kinect_noise(render(T), rng)
+    depth = kinect_noise(render(T), np.random.default_rng(3), far=6.0)
     corner, side = np.floor(T[:2, 3] / 0.05) - 85, 171
-    args = (corner, 3, 0.05, 0.5, 4.0, 0.05, 0.5, 0.0012, 0.0019)
-    n_band, layers, floor = np.zeros((side, side), np.int32), np.zeros((side, side), np.uint16), np.zeros((side, side), np.uint8)
-    grid_evidence._sort_points(depth, KINECT.rays, T, *args, n_band, layers, floor)
-    expected = naive.sorted_points(depth, KINECT.rays, T, *args, side)
-    assert n_band.sum() > 100 and floor.sum() > 100
-    np.testing.assert_array_equal(n_band, expected[0])
-    np.testing.assert_array_equal(layers, expected[1])
-    np.testing.assert_array_equal(floor > 0, expected[2])
+    args = (corner, 5, 0.05, 0.5, 4.0, 0.05, 0.5, 0.0012, 0.0019)
+    crossed = np.zeros((side, side), np.uint16)
+    grid_evidence._cross(depth, KINECT.rays, T, *args, crossed)
+    expected = np.zeros((side, side), np.uint16)
+    for i, j, k in naive.crossed_slices(depth, KINECT.rays, T, *args, side):
+        expected[i, j] |= np.uint16(1 << k)
+    assert (crossed > 0).sum() > 300
+    np.testing.assert_array_equal(crossed, expected)
 
 
 def test_lines_of_sight_match_their_slow_twin():
@@ -147,13 +167,18 @@ def test_lines_of_sight_match_their_slow_twin():
     standing = (rng.integers(0, 1 << 16, (40, 50)) * (rng.random((40, 50)) < 0.06)).astype(np.uint16)
     standing[rng.random((40, 50)) < 0.03] = 0b1111111100000000
     rows, columns = (index.ravel() for index in np.mgrid[0:40, 0:50])
+    is_open = rng.integers(0, 1 << 16, (40, 50)).astype(np.uint16) | np.where(rng.random((40, 50)) < 0.5, 0xFFFF, 0).astype(np.uint16)
+    face, around = (rng.integers(0, 3, (40, 50)).astype(np.int32) * (rng.random((40, 50)) < 0.3) for _ in range(2))
     for camera in ((10.3, 20.7, 0.6), (-5.0, 60.0, 1.4), (25.5, 20.5, 0.3)):
-        got = np.arange(len(rows)) % 7 > 0
+        got, hangs = np.arange(len(rows)) % 7 > 0, np.zeros((40, 50), np.uint16)
         was_hidden = ~got
-        grid._drop_hidden(got, standing, rows, columns, *camera, 0.05, 0.5, 20.0)
-        expected = np.array([naive.is_clear(standing, r, c, *camera, 0.05, 0.5, 20.0) for r, c in zip(rows, columns, strict=True)])
+        grid._drop_hidden(got, standing, is_open, hangs, face, around, rows, columns, *camera, 0.05, 0.5, 20.0)
+        expected = np.array(
+            [naive.is_clear(standing, is_open, face, around, r, c, *camera, 0.05, 0.5, 20.0) for r, c in zip(rows, columns, strict=True)]
+        )
         np.testing.assert_array_equal(got, expected & ~was_hidden)
         assert 0.15 < np.mean(~got) < 0.98
+        assert (hangs > 0).any() and not (hangs & ~standing).any()
 
 
 def test_equation_20():
@@ -217,7 +242,10 @@ def view(cell, n, camera=None, is_floor=False, layers=0xFFFF):
     cell = np.atleast_2d(np.array(cell, np.int32))
     k = len(cell)
     camera = camera or (*(cell[0] + 0.5) * 0.05, 0.6)
-    return View(cell, np.full(k, n, np.int32), np.full(k, layers, np.uint16), np.full(k, is_floor), np.array(camera))
+    no_cell = np.zeros((0, 2), np.int32), np.zeros(0, np.uint16)
+    return View(
+        cell, np.full(k, n, np.int32), np.full(k, layers, np.uint16), np.full(k, 2 * is_floor, np.uint8), np.zeros(k, bool), np.zeros(k, bool), np.array(camera), *no_cell
+    )  # fmt: skip
 
 
 def test_a_grid_of_one_row_and_one_of_one_cell():
