@@ -17,6 +17,7 @@ HIP_WIDTH = 0.09  # [m] from the middle to one hip
 STRIDE = 1.3  # [m] walked in a full cycle of both legs
 LEG_SWING, ARM_SWING = 0.45, 0.5  # [rad] at a walk
 KNEE_BEND = 0.9  # [rad] of the leg that swings forward
+COATS = 0.5  # share of the people in long coats
 SKIN = ((232, 190, 160), (198, 142, 104), (140, 92, 66), (96, 62, 46))
 HAIR = ((44, 34, 30), (112, 78, 48), (190, 160, 110), (150, 150, 150))
 CARRIED = np.array([0.2, 0.27, 0.17])  # [m] half the sides of the box that is carried
@@ -55,7 +56,7 @@ class Figure:
 
 
 def dress(rng: np.random.Generator) -> list[Part]:
-    """Draw a person's clothes; the parts are in the order of `limbs`."""
+    """Draw a person's clothes; the parts are in the order of `limbs`, the last of which not everybody wears."""
     palette = pick(rng, PALETTES)
     shirt = pick(rng, (p.shapes, p.mosaic, t.stripes((palette[0], palette[2], palette[4]), 0.09), t.fabric(palette[3], palette[1])))
     trousers = pick(rng, (t.fabric(palette[4], palette[2]), t.stripes((palette[4], palette[3], palette[2]), 0.12), p.mosaic, p.shapes))
@@ -73,11 +74,12 @@ def dress(rng: np.random.Generator) -> list[Part]:
     ]  # fmt: skip
     body = [part("pelvis", (0.12, 0.17, 0.14), trousers), part("torso", (0.13, 0.2, 0.33), shirt)]
     head = [part("head", (0.1, 0.08, 0.125), skin), part("hair", (0.105, 0.088, 0.1), hair)]
-    return [*body, *head, *both[0], *both[1]]
+    coat = [part("coat", (0.24, 0.27, 0.42), shirt)]
+    return [*body, *head, *both[0], *both[1], *(coat if rng.random() < COATS else [])]
 
 
 def limbs(posture: Posture, size: float) -> np.ndarray:
-    """Place the parts of a person, T_lp (N, 16, 4, 4); `size` scales a person of 1.72 m."""
+    """Place the parts of a person, T_lp (N, 17, 4, 4); `size` scales a person of 1.72 m."""
     n = len(posture.heading)
     swing = [np.sin(posture.phase), -np.sin(posture.phase)]
     lift = [np.maximum(0.0, np.cos(posture.phase)), np.maximum(0.0, -np.cos(posture.phase))]
@@ -101,6 +103,7 @@ def limbs(posture: Posture, size: float) -> np.ndarray:
         elbow = shoulder + UPPER_ARM * _along(arm)
         wrist = elbow + FOREARM * _along(forearm)
         placed += [((shoulder + elbow) / 2, _turn(-arm)), ((elbow + wrist) / 2, _turn(-forearm)), (wrist, _turn(-forearm))]
+    placed += [(hips + [0.0, 0.0, -0.12], _turn(0.5 * lean))]
     T_fp = np.tile(np.eye(4), (n, len(placed), 1, 1))
     for k, (centre, R) in enumerate(placed):
         T_fp[:, k, :3, 3], T_fp[:, k, :3, :3] = size * centre, R

@@ -70,7 +70,7 @@ def _person(name: str, activity: str, course: Course, rng: np.random.Generator) 
         return Posture(np.column_stack([x, y]), *rest)
 
     def with_limbs(stamp: np.ndarray) -> np.ndarray:
-        return limbs(posture(stamp), size)
+        return limbs(posture(stamp), size)[:, : len(parts)]
 
     scaled = [Part(part.name, part.kind, size * part.half, part.painter) for part in parts]
     found = [Figure(name, "person", scaled, with_limbs)]
@@ -97,8 +97,8 @@ def _carried(posture: Callable[[np.ndarray], Posture], t: np.ndarray) -> Callabl
 
 def _beside(course: Course, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Walk before the camera all the time, now nearer, now farther."""
-    near = rng.uniform(0.95, 1.35)
-    distance = near + 0.3 * np.sin(2 * np.pi * course.t / rng.uniform(5, 8) + rng.uniform(0, 6))
+    near = rng.uniform(0.85, 1.15)
+    distance = near + 0.25 * np.sin(2 * np.pi * course.t / rng.uniform(5, 8) + rng.uniform(0, 6))
     aside = 0.25 * np.sin(2 * np.pi * course.t / rng.uniform(6, 9) + rng.uniform(0, 6))
     return _place(course, distance, aside), *_upright(course)
 
@@ -130,7 +130,7 @@ def _sit(course: Course, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarr
 def _carry(course: Course, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Stand by a box, pick it up and carry it along, with rests."""
     xy, waits = _wait_and_go(course, rng)
-    leaves = course.t[np.argmin(waits)]
+    leaves = np.inf if waits.all() else course.t[np.argmin(waits)]
     return xy, np.zeros(len(course.t)), np.clip((course.t - leaves + PICK_UP) / PICK_UP, 0.0, 1.0)
 
 
