@@ -9,7 +9,7 @@ from numba import f4, f8, i4, i8, u1
 from slamcli.datasets.simulated.figures import BOX, Figure, Part
 from slamcli.geometry import se3
 from slamcli.geometry.camera import Camera
-from slamcli.kernels import kernel
+from slamcli.jit.kernel import kernel
 
 SAMPLES = np.array([[0.0, 0.0], [-0.375, -0.125], [0.125, -0.375], [0.375, 0.125], [-0.125, 0.375]])  # [px] the centre, then a rotated grid
 
