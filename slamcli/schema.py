@@ -114,6 +114,16 @@ class Map:
 
 
 @dataclass(frozen=True)
+class Moving:
+    """What moves in each frame's view, by track and, as the final poses show it, by loop: no map shows it and no pose rests on it.
+
+    Rows v and columns u are of square blocks of the undistorted colour image. Without rows nothing moves.
+    """
+
+    moving: np.ndarray = array("?", "F v u", "whether what a block shows moves", may_lack=True)
+
+
+@dataclass(frozen=True)
 class Timing:
     """When the camera measures, found by optimize from the recording itself."""
 

@@ -95,7 +95,7 @@ def export_mesh(out: Path, run: str | None, voxel: float) -> None:
     from slamcli.dense.tsdf import Volume
     from slamcli.formats.cloud import write_ply_mesh
     from slamcli.runs.run_directory import RunDir
-    from slamcli.schema import Ground
+    from slamcli.schema import Ground, Moving
     from slamcli.stages import densify
     from slamcli.stages.depth_frames import depth_poses
 
@@ -105,7 +105,9 @@ def export_mesh(out: Path, run: str | None, voxel: float) -> None:
     option = replace(config.densify, method="tsdf", voxel=voxel)
     poses = console.progress(depth_poses(folder), "mesh")
     volume = Volume(camera, voxel=voxel, depth_max=option.depth_max)
-    for view in densify.views(folder.dataset(), camera, poses, config.sensor, option, workers=config.run.workers):
+    for view in densify.views(
+        folder.dataset(), camera, poses, config.sensor, option, moving=folder.load(Moving, "loop"), workers=config.run.workers
+    ):
         volume.add(view.seen, view.rgb, view.T_wk)
     mesh = volume.mesh().moved(T_lw)
     if not len(mesh.triangle):

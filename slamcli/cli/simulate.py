@@ -27,7 +27,10 @@ import click
 @click.option("--moved-object", "movable", is_flag=True, help="A parcel is taken away half-way.")
 @click.option("--people", type=click.IntRange(0, 20), default=0, show_default=True, help="Figures that walk about in view.")
 @click.option(
-    "--activity", "activities", multiple=True, type=click.Choice(["beside", "cross", "stand", "approach", "sit", "carry"]),
+    "--activity",
+    "activities",
+    multiple=True,
+    type=click.Choice(["beside", "cross", "stand", "approach", "sit", "carry"]),
     help="What they do, in turn; may be repeated. [default: all of these]",
 )
 @click.option(

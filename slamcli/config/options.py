@@ -180,6 +180,9 @@ class TrackConfig:
     shape_hold: float = option(
         1.0, "where shape leaves a direction open, as along a flat wall, it is taken from the motion before it for so long [s]", ge=0, le=10
     )
+    moving_objects: bool = option(
+        True, "look for what moves, such as people, by views that look through where it was, and rest poses and maps on what stands still"
+    )
     share_key_frames: int = option(10, "neighbours in which a new key frame's landmarks are looked for", ge=0)
     share_max_distance: int = option(50, "descriptors that differ more are not one landmark [bits]", ge=1, le=256)
     window_key_frames: int = option(12, "key frames adjusted with each new one", ge=2)

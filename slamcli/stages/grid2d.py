@@ -12,7 +12,7 @@ from slamcli.navigation import grid
 from slamcli.navigation.driven import mark_driven
 from slamcli.navigation.grid_evidence import View, look
 from slamcli.navigation.robot_pose import planar_pose
-from slamcli.schema import Features, Grid, Ground, Map, Tracks, frame_poses
+from slamcli.schema import Features, Grid, Ground, Map, Moving, Tracks, frame_poses
 from slamcli.stages.contract import Inputs, Summary, Tools
 from slamcli.stages.depth_frames import depth_poses, read_depth
 
@@ -44,7 +44,7 @@ def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
 
 
 def _from_depth(inputs: Inputs, T_lw: np.ndarray, cfg: Config, tools: Tools) -> tuple[Grid, int]:
-    option, camera = cfg.grid2d, inputs.camera("loop")
+    option, camera, moving = cfg.grid2d, inputs.camera("loop"), inputs.load(Moving, "loop")
     rays = np.ascontiguousarray(camera.rays)
     has_depth = np.isfinite(inputs.load(Features, "extract").depth_stamp)
     poses = [(frame, T_lw @ T_wd) for frame, T_wd in depth_poses(inputs, frames="all") if has_depth[frame]]
@@ -54,5 +54,5 @@ def _from_depth(inputs: Inputs, T_lw: np.ndarray, cfg: Config, tools: Tools) -> 
         return look(depth, rays, T_ld, settings=option, sensor=cfg.sensor)
 
     spaced = tools.progress([poses[row] for row in chosen.tolist()], "grid2d")
-    views = list(read_depth(inputs.dataset, camera, spaced, look_at, workers=tools.workers, warn=tools.warn))
+    views = list(read_depth(inputs.dataset, camera, spaced, look_at, moving=moving, workers=tools.workers, warn=tools.warn))
     return grid.fuse(views, settings=option), len(views)

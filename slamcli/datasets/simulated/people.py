@@ -35,7 +35,9 @@ class Course:
     high: np.ndarray  # (2,)
 
 
-def populate(motion: Motion, low: np.ndarray, high: np.ndarray, *, people: int, activities: tuple[str, ...], drives: bool, seed: int) -> list[Figure]:
+def populate(
+    motion: Motion, low: np.ndarray, high: np.ndarray, *, people: int, activities: tuple[str, ...], drives: bool, seed: int
+) -> list[Figure]:
     """Plan the walks of `people` figures, who take up `activities` in turn.
 
     low, high : (3,) [m] corners of the room
@@ -161,7 +163,7 @@ def _wait_and_go(course: Course, rng: np.random.Generator) -> tuple[np.ndarray, 
     place, since, is_waiting = goal[0], course.t[0], True
     for i, t in enumerate(course.t):
         step = goal[i] - place
-        if is_waiting and (t - since >= WAIT or np.linalg.norm(place - camera[i]) < SHY) or (
+        if (is_waiting and (t - since >= WAIT or np.linalg.norm(place - camera[i]) < SHY)) or (
             not is_waiting and t - since >= GO and np.linalg.norm(step) < ARRIVED
         ):
             is_waiting, since = not is_waiting, t
