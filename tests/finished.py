@@ -13,7 +13,7 @@ from slamcli.formats.trajectory import write_tum
 from slamcli.geometry import se3
 from slamcli.runs import pipeline, source_code, staleness
 from slamcli.runs.run_directory import RunDir, outputs
-from slamcli.schema import FORMAT, Closures, Features, Ground, Map, Timing, Tracks, Trajectory, trajectory
+from slamcli.schema import FORMAT, Closures, Features, Ground, Map, Moving, Timing, Tracks, Trajectory, trajectory
 from slamcli.stages import STAGES
 
 START = 1305031102.0  # [s]
@@ -114,9 +114,9 @@ def _results(rng: np.random.Generator, truth: Trajectory, lost: np.ndarray) -> d
     when = Timing(readout=np.array(0.0), depth_readout=np.array(0.0), depth_delay=np.array(0.0), twist=np.zeros((frames, 6)))
     return {
         "extract": (features,),
-        "track": (track, maps["track"]),
+        "track": (track, maps["track"], Moving()),
         "optimize": (track, when, maps["track"]),
-        "loop": (loop, closures, when, maps["loop"]),
+        "loop": (loop, closures, when, maps["loop"], Moving()),
         "densify": (ground,),
     }
 
