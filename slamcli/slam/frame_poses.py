@@ -31,6 +31,11 @@ class FramePoses:
         self.lost_reason: dict[int, str] = {}
         self.latest = self.anchored = -1
 
+    @property
+    def has_background(self) -> bool:
+        """Say whether the motion from frame to frame is known beforehand."""
+        return self._background is not None
+
     def tracks(self) -> Tracks:
         """Return the poses of all frames as an artefact."""
         return Tracks(ref_kf=self.ref_kf, T_kc=self.T_kc, state=self.state, n_inliers=self.n_inliers)
