@@ -26,6 +26,8 @@ from slamcli.stages.contract import Inputs, Summary, Tools
 from slamcli.stages.map_outputs import save_map
 from slamcli.stages.moving_parts import NOTHING
 
+BACKGROUND_ROUNDS = 2  # the second halves the error of the motion from frame to frame, a third does not help
+
 
 def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
     """Track every frame and build the map of key frames and landmarks; where things move, once more without them."""
@@ -57,12 +59,18 @@ def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
 
 
 def _find_background(inputs: Inputs, cfg: Config, tools: Tools) -> tuple[Moving, np.ndarray]:
-    """Find how the camera moved against what stands still, T_wc (F, 4, 4) that drift, and what moves under these poses."""
-    features, depth, camera = inputs.load(Features, "extract"), inputs.load(CoarseDepth, "extract").coarse_depth, inputs.camera()
-    motion = BackgroundMotion(features, inputs.load(Words, "match"), depth, camera, cfg.sensor, tools.rng())
-    T_wc = motion.poses(lambda anchors: tools.progress(anchors, "background"))
-    views = moving_objects.Views(depth, np.asarray(features.stamp), T_wc, np.zeros(len(T_wc), dtype=np.int64), camera)
-    return Moving(moving_objects.find(views, lambda frames: tools.progress(frames, "moving objects"))), T_wc
+    """Find how the camera moved against what stands still, T_wc (F, 4, 4) that drift, and what moves under these poses.
+
+    Once most of what moves is known, the motion is found again without it.
+    """
+    words, depth, camera, moving = inputs.load(Words, "match"), inputs.load(CoarseDepth, "extract").coarse_depth, inputs.camera(), NOTHING
+    for _ in range(BACKGROUND_ROUNDS):
+        features, still = moving_parts.still(inputs, moving)
+        motion = BackgroundMotion(features, words, still.coarse_depth, camera, cfg.sensor, tools.rng())
+        T_wc = motion.poses(lambda anchors: tools.progress(anchors, "background"))
+        views = moving_objects.Views(depth, np.asarray(features.stamp), T_wc, np.zeros(len(T_wc), dtype=np.int64), camera)
+        moving = Moving(moving_objects.find(views, lambda frames: tools.progress(frames, "moving objects")))
+    return moving, T_wc
 
 
 def _track(inputs: Inputs, moving: Moving, background: np.ndarray | None, cfg: Config, tools: Tools) -> Tracker:
