@@ -124,6 +124,16 @@ class Moving:
 
 
 @dataclass(frozen=True)
+class Doubt:
+    """How far each frame's pose can be trusted, by loop."""
+
+    contradicted: np.ndarray = array("f4", "F", "share of the surface seen that other views look through, NaN = unknown")
+    disagreement: np.ndarray = array("f4", "F", "m, between the motion within half a second as track and as loop found it, NaN = unknown")
+    sigma: np.ndarray = array("f4", "F", "m, standard deviation of the position beside the frames around, NaN = lost")
+    is_doubtful: np.ndarray = array("?", "F", "verdict")
+
+
+@dataclass(frozen=True)
 class Timing:
     """When the camera measures, found by optimize from the recording itself."""
 

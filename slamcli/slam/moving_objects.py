@@ -121,7 +121,7 @@ def _followed(views: Views, frame: int, z: np.ndarray, before: np.ndarray) -> np
 
 def weigh(views: Views, frame: int, after: tuple[float, ...]) -> Evidence | None:
     """Compare a view with those `after` [s] before and after it; None where none can be compared."""
-    others = _others(views, frame, after)
+    others = _others(views, frame, after) if views.depth.size else np.zeros(0, dtype=np.int64)
     if len(others) == 0 or not np.isfinite(views.T_wc[frame, 0, 0]):
         return None
     small, row_at = icp.coarse_camera(views.camera)
@@ -169,7 +169,7 @@ def hide_features(features: Features, moving: np.ndarray, camera: Camera) -> Fea
     side = _side(camera)
     row, column = ((features.xy[:, k] + 0.5) // side for k in (1, 0))
     row, column = row.astype(np.int64).clip(0, moving.shape[1] - 1), column.astype(np.int64).clip(0, moving.shape[2] - 1)
-    is_moving = np.array([_with_margin(mask) for mask in moving])[frame, row, column]
+    is_moving = np.array([with_margin(mask) for mask in moving])[frame, row, column]
     xy, depth = np.array(features.xy), np.array(features.depth)
     xy[is_moving], depth[is_moving] = OUT_OF_SIGHT, np.nan
     return replace(features, xy=xy, depth=depth)
@@ -183,16 +183,16 @@ def hide_coarse(depth: CoarseDepth, moving: np.ndarray, camera: Camera) -> Coars
     lookup = _lookup(small, STEP, moving.shape[1:])
     images = np.array(depth.coarse_depth)
     for image, mask in zip(images, moving, strict=True):
-        image[np.append(_with_margin(mask).ravel(), False)[lookup]] = 0
+        image[np.append(with_margin(mask).ravel(), False)[lookup]] = 0
     return CoarseDepth(coarse_depth=images)
 
 
 def hide_pixels(depth: np.ndarray, mask: np.ndarray, camera: Camera) -> np.ndarray:
     """Remove what moves from a depth image (H, W) [m]; mask : (v, u) bool."""
-    return np.where(np.append(_with_margin(mask).ravel(), False)[_lookup(camera, _side(camera), mask.shape)], np.float32(np.nan), depth)
+    return np.where(np.append(with_margin(mask).ravel(), False)[_lookup(camera, _side(camera), mask.shape)], np.float32(np.nan), depth)
 
 
-def _with_margin(mask: np.ndarray) -> np.ndarray:
+def with_margin(mask: np.ndarray) -> np.ndarray:
     """Widen a mask (v, u) by one place: outlines of what moves are found least surely, and features sit on outlines."""
     return cv2.dilate(mask.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
 

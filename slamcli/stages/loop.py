@@ -60,18 +60,26 @@ def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
     save_map(out, features.stamp, tracks, map_)
     moving = moving_parts.find(inputs, tracks, map_, tools) if len(moving.moving) else moving
     artifacts.save(moving, out)
+    first = inputs.load(Tracks, "track"), inputs.load(Map, "track")
+    doubts = pose_doubt.judge(moving_parts.views(inputs, tracks, map_), moving.moving, first, (tracks, map_))
+    artifacts.save(doubts, out)
     artifacts.save(when, out)
     write_camera(out, camera)
     artifacts.save(closures_of(accepted), out)
-    return {
-        "frames": len(features.stamp),
-        "candidates": len(tried),
-        "closures": len(accepted),
-        "segments": map_segments.n_segments(map_),
-        "lost": int((tracks.state == LOST).sum()),
-        "apart": int((frame_segments(tracks, map_) > 0).sum()),
-        "landmarks": len(map_.lm_xyz),
-    } | moving_parts.told(moving)
+    return (
+        {
+            "frames": len(features.stamp),
+            "candidates": len(tried),
+            "closures": len(accepted),
+            "segments": map_segments.n_segments(map_),
+            "lost": int((tracks.state == LOST).sum()),
+            "apart": int((frame_segments(tracks, map_) > 0).sum()),
+            "landmarks": len(map_.lm_xyz),
+            "doubtful": int(doubts.is_doubtful.sum()),
+        }
+        | moving_parts.told(moving)
+        | doubt.to_summary(pose_doubt.findings(doubts))
+    )
 
 
 def main_first(map_: Map, tracks: Tracks, main: int) -> Map:

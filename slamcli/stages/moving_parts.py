@@ -14,13 +14,13 @@ MOVES = 0.01  # share of a view, from which on a frame counts as one with moving
 
 def are_any(inputs: Inputs, tracks: Tracks, map_: Map) -> bool:
     """Say whether anything moves in the recording, seen from these poses; nothing does where depth is missing."""
-    views = _views(inputs, tracks, map_)
-    return views.depth.size > 0 and moving_objects.is_any(views)
+    seen = views(inputs, tracks, map_)
+    return seen.depth.size > 0 and moving_objects.is_any(seen)
 
 
 def find(inputs: Inputs, tracks: Tracks, map_: Map, tools: Tools) -> Moving:
     """Find what moves in every frame, seen from these poses."""
-    found = moving_objects.find(_views(inputs, tracks, map_), lambda frames: tools.progress(frames, "moving objects"))
+    found = moving_objects.find(views(inputs, tracks, map_), lambda frames: tools.progress(frames, "moving objects"))
     return Moving(found) if found.any() else Moving()
 
 
@@ -42,7 +42,8 @@ def told(moving: Moving) -> Summary:
     return {"frames_with_motion": len(moves), "share_that_moves": float(moves.mean())} if len(moves) else {}
 
 
-def _views(inputs: Inputs, tracks: Tracks, map_: Map) -> Views:
+def views(inputs: Inputs, tracks: Tracks, map_: Map) -> Views:
+    """Gather the coarse depth images with these poses."""
     features, world = inputs.load(Features, "extract"), frame_segments(tracks, map_)
     T_wc = np.full((len(world), 4, 4), np.nan)
     for segment in np.unique(world[world >= 0]):
