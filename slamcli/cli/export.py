@@ -16,10 +16,11 @@ from slamcli.cli.common import check_ending, json_option, mount_option, run_opti
 @click.option("--stage", type=click.Choice(["track", "optimize", "loop"]), help="Whose trajectory; default: the last there is.")
 @click.option("--frame", type=click.Choice(["world", "level"]), default="world", show_default=True, help="level: z up, floor at z = 0.")
 @click.option("--format", "layout", type=click.Choice(["tum", "kitti"]), default="tum", show_default=True, help="kitti has no time stamps.")
+@click.option("--sure-only", is_flag=True, help="Leave out the poses that the run itself doubts; of the final trajectory.")
 @mount_option
 @json_option
 def export_trajectory(
-    out: Path, run: str | None, stage: str | None, frame: str, layout: str, mount: tuple[float, ...] | None, as_json: bool
+    out: Path, run: str | None, stage: str | None, frame: str, layout: str, mount: tuple[float, ...] | None, as_json: bool, sure_only: bool
 ) -> None:
     """Write the camera's trajectory to OUT (.txt, .tum, .csv or .kitti): pose of the colour camera, camera to world.
 
@@ -38,6 +39,8 @@ def export_trajectory(
     check_ending(out, ".txt", ".tum", ".csv", ".kitti")
     folder = RunDir.find(run)
     trajectory = trajectory_error.stage_trajectory(folder, stage or trajectory_error.last_stage(folder))
+    if sure_only:
+        trajectory = trajectory_error.sure_part(folder, trajectory)
     T_wc = trajectory.T_wc
     if frame == "level":
         ground = folder.load(Ground, "densify")

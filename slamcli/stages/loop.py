@@ -14,7 +14,7 @@ from slamcli.errors import SlamError
 from slamcli.formats.g2o import write_g2o
 from slamcli.geometry.camera import Camera
 from slamcli.schema import LOST, Closures, Map, Moving, Timing, Tracks, Words, frame_segments
-from slamcli.slam import final_refinement, loop_closing, map_merging, map_segments
+from slamcli.slam import doubt, final_refinement, loop_closing, map_merging, map_segments, pose_doubt
 from slamcli.slam.depth_tracking import Reliefs
 from slamcli.slam.loop_closing import Candidate
 from slamcli.slam.place_recognition import PlaceIndex
