@@ -36,10 +36,10 @@ REFINED = 3  # best motions that are refined
 LEAST = 10  # matches that a refinement needs
 MAX_DISTANCE, RATIO = 64, 0.85  # of descriptors, as in the match stage, a little looser: frames lie farther apart
 FLATNESS = np.array([0.015, 0.006])  # [m, 1/m] distance between surfaces that are the same, and its growth with (z - 0.4)^2
-SWERVE_M, SWERVE_RAD, SWERVE_COST, SWERVE_MOST = 0.08, 0.08, 0.1, 0.6  # change of motion that costs so much of the surface, and at most
+SWERVE_M, SWERVE_RAD, SWERVE_COST, SWERVE_MOST = 0.08, 0.08, 0.1, 0.3  # change of motion that costs so much of the surface, and at most
 LOOSE = np.array([0.02] * 3 + [0.01] * 3)  # [m, rad] how far ICP may go where no match holds it
 TIGHT = np.array([0.007] * 3 + [0.004] * 3)  # of frames between anchors, whose place is nearly known
-POOR_SHARE, POOR_RATIO = 0.4, 5.0  # surface explained, and how many times what contradicts, below which the grid is searched too
+POOR_SHARE, POOR_RATIO = 0.4, 10.0  # surface explained, and how many times what contradicts, below which the grid is searched too
 GRID_M, GRID_RAD = (-0.2, -0.1, 0.0, 0.1, 0.2), (-0.12, 0.0, 0.12)  # forward, and turned to a side
 SCHEDULE = np.array([(4.0, 0.10, 6.0, 5e-4), (2.0, 0.05, 5.0, 2e-4)])  # as of depth/icp.py: with a shorter reach
 NEAR_VARIANCE = 4.0  # [m^2] at which distance squared a reading's variance is as the sensor's; nearer counts less
@@ -60,7 +60,7 @@ class Common:
     weight: np.ndarray  # (N,) [m^2] surface that each stands for
     source: Relief  # of the reference
     target: Relief  # of the frame
-    surface: float  # [m^2] that the source shows
+    surface: float  # [m^2] that each shows, on average
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ class BackgroundMotion:
             tried.append(expected)
         tried += self._sampled(common)
         best = self._best(common, tried, expected, LOOSE, None)
-        if best.explained < POOR_RATIO * best.contradicted or best.explained < POOR_SHARE:
+        if expected is None or best.explained < POOR_RATIO * best.contradicted or best.explained < POOR_SHARE:
             around = [se3.exp(np.array([0.0, 0.0, z, 0.0, turn, 0.0])) for z in GRID_M for turn in GRID_RAD]
             start = np.eye(4) if expected is None else expected
             best = self._best(common, [step @ start for step in around], expected, LOOSE, best)
@@ -134,11 +134,11 @@ class BackgroundMotion:
         return best
 
     def _judge(self, common: Common, T: np.ndarray, expected: np.ndarray | None) -> Judgement:
-        source, target = common.source, common.target
+        """Judge a motion by both frames: a surface that comes nearer hides its old place from the one and is looked through by the other."""
         T = np.ascontiguousarray(T)
-        explained, contradicted = kernels.explain(
-            T, source.xyz, source.normal, target.row, target.xyz, target.normal, target.pinhole, FLATNESS[0], FLATNESS[1]
-        )
+        there = _explain(T, common.source, common.target)
+        back = _explain(np.ascontiguousarray(se3.inverse(T)), common.target, common.source)
+        explained, contradicted = (0.5 * (one + other) for one, other in zip(there, back, strict=True))
         agrees = np.zeros(len(common.weight), dtype=np.bool_)
         _, matched = kernels.vote(T[None], *self._votes_of(common, np.arange(len(agrees))), CHI2_AGREE, agrees)
         cost = 0.0
@@ -213,7 +213,7 @@ class BackgroundMotion:
             weight=cell_rad2 * x_r[:, 2] ** 2 / np.maximum(share, 1),
             source=source,
             target=target,
-            surface=kernels.surface(source.xyz, source.normal, source.pinhole),
+            surface=0.5 * sum(kernels.surface(one.xyz, one.normal, one.pinhole) for one in (source, target)),
         )
 
     def _matches(self, reference: int, i: int) -> tuple[np.ndarray, np.ndarray]:
@@ -242,6 +242,10 @@ def anchor_frames(stamp: np.ndarray) -> list[int]:
         following = int(np.searchsorted(stamp, stamp[anchors[-1]] + SPACING - 1e-6))
         anchors.append(min(max(following, anchors[-1] + 1), len(stamp) - 1))
     return anchors
+
+
+def _explain(T: np.ndarray, source: Relief, target: Relief) -> tuple[float, float]:
+    return kernels.explain(T, source.xyz, source.normal, target.row, target.xyz, target.normal, target.pinhole, FLATNESS[0], FLATNESS[1])
 
 
 def _align(T: np.ndarray, source: Relief, target: Relief, known: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
