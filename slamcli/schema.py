@@ -114,6 +114,26 @@ class Map:
 
 
 @dataclass(frozen=True)
+class Moving:
+    """What moves in each frame's view, by track and, as the final poses show it, by loop: no map shows it and no pose rests on it.
+
+    Rows v and columns u are of square blocks of the undistorted colour image. Without rows nothing moves.
+    """
+
+    moving: np.ndarray = array("?", "F v u", "whether what a block shows moves", may_lack=True)
+
+
+@dataclass(frozen=True)
+class Doubt:
+    """How far each frame's pose can be trusted, by loop."""
+
+    contradicted: np.ndarray = array("f4", "F", "share of the surface seen that other views look through, NaN = unknown")
+    disagreement: np.ndarray = array("f4", "F", "m, between the motion within half a second as track and as loop found it, NaN = unknown")
+    sigma: np.ndarray = array("f4", "F", "m, standard deviation of the position beside the frames around, NaN = lost")
+    is_doubtful: np.ndarray = array("?", "F", "verdict")
+
+
+@dataclass(frozen=True)
 class Timing:
     """When the camera measures, found by optimize from the recording itself."""
 

@@ -14,7 +14,7 @@ from slamcli.formats.trajectory import write_tum
 from slamcli.geometry import se3
 from slamcli.runs import pipeline, source_code, staleness
 from slamcli.runs.run_directory import RunDir, outputs
-from slamcli.schema import FORMAT, Closures, Features, Ground, Map, Timing, Tracks, Trajectory, trajectory
+from slamcli.schema import FORMAT, Closures, Doubt, Features, Ground, Map, Moving, Timing, Tracks, Trajectory, trajectory
 from slamcli.stages import STAGES
 
 START = 1305031102.0  # [s]
@@ -113,11 +113,13 @@ def _results(rng: np.random.Generator, truth: Trajectory, lost: np.ndarray) -> d
     track, loop = (_tracks(found[name].T_wc, kf_frame, lost) for name in ("track", "loop"))
     maps = {name: _map(T_wc[kf_frame], kf_frame) for name, T_wc in (("track", found["track"].T_wc), ("loop", found["loop"].T_wc))}
     when = Timing(readout=np.array(0.0), depth_readout=np.array(0.0), depth_delay=np.array(0.0), twist=np.zeros((frames, 6)))
+    unknown, sure = np.full(frames, np.nan, np.float32), np.full(frames, 0.003, np.float32)
+    doubts = Doubt(contradicted=unknown, disagreement=unknown, sigma=sure, is_doubtful=lost.copy())
     return {
         "extract": (features,),
-        "track": (track, maps["track"]),
+        "track": (track, maps["track"], Moving()),
         "optimize": (track, when, maps["track"]),
-        "loop": (loop, closures, when, maps["loop"]),
+        "loop": (loop, closures, when, maps["loop"], Moving(), doubts),
         "densify": (ground,),
     }
 

@@ -29,6 +29,8 @@ APE_COLUMNS = {
     "coverage": ("coverage", ".1%"),
     "scale": ("scale", ".4f"),
     "rmse_scaled": ("RMSE scaled [m]", ".4f"),
+    "doubtful": ("doubtful", "d"),
+    "rmse_sure": ("RMSE sure [m]", ".4f"),
 }
 RPE_COLUMNS = {
     "name": ("trajectory", ""),
@@ -92,16 +94,16 @@ def ape_command(
     """
     from slamcli.evaluation import plots, tables, trajectory_error
 
-    results = []
+    results, rows = [], []
     for folder in _open_runs(runs, run):
         true, n_frames = _truth(folder, truth, truth_offset), trajectory_error.frame_count(folder)
         for name, which, estimate in _trajectories(folder, stage, other):
             results.append(trajectory_error.ape(estimate, true, n_frames=n_frames, name=name, stage=which))
+            rows.append(results[-1].to_dict() | trajectory_error.sure_figures(folder, results[-1]))
             if which:
-                _record(folder, "ape.json", results[-1].to_dict())
+                _record(folder, "ape.json", rows[-1])
     if plot is not None:
         plots.plot_ape(results, plot)
-    rows = [result.to_dict() for result in results]
     click.echo(_json(rows, several=_are_several(runs, stage, other)) if as_json else tables.render(rows, APE_COLUMNS, style))
 
 

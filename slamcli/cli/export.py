@@ -31,10 +31,18 @@ LAYOUT_OF = {".txt": "tum", ".tum": "tum", ".kitti": "kitti", ".csv": "csv"}
 @click.option(
     "--format", "layout", type=click.Choice(["tum", "kitti", "csv"]), help="[default: by OUT's ending]; kitti has no time stamps."
 )
+@click.option("--sure-only", is_flag=True, help="Leave out the poses that the run itself doubts; of the final trajectory.")
 @mount_option
 @json_option
 def export_trajectory(
-    out: Path, run: str | None, stage: str | None, frame: str, layout: str | None, mount: tuple[float, ...] | None, as_json: bool
+    out: Path,
+    run: str | None,
+    stage: str | None,
+    frame: str,
+    layout: str | None,
+    mount: tuple[float, ...] | None,
+    as_json: bool,
+    sure_only: bool,
 ) -> None:
     """Write the camera's trajectory to OUT: pose of the colour camera, camera to world.
 
@@ -58,6 +66,8 @@ def export_trajectory(
         return
     layout = layout or LAYOUT_OF[ending]
     trajectory = trajectory_error.stage_trajectory(folder, stage or trajectory_error.last_stage(folder))
+    if sure_only:
+        trajectory = trajectory_error.sure_part(folder, trajectory)
     T_wc = trajectory.T_wc
     if frame == "level":
         ground = folder.load(Ground, "densify")

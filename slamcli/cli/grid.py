@@ -59,6 +59,7 @@ def export_grid(out: Path, run: str | None, png: Path | None, mount: tuple[float
     folder = RunDir.find(run)
     grid = folder.load(Grid, "grid2d")
     warn_without_floor(folder)
+    warn_of_doubt(folder)
     start = _start(folder, mount)
     written: tuple[Path, ...] = grid_map.write(out, grid_map.GridMap.of(grid), start=start)
     if png is not None:
@@ -134,6 +135,7 @@ def plan(
         folder = RunDir.find(run)
         grid = folder.load(Grid, "grid2d")
         warn_without_floor(folder)
+        warn_of_doubt(folder)
         trajectory, title = camera_path(folder), str(folder.info()["dataset"])
         radius = folder.config().robot.radius if radius is None else radius
         png = png or folder.path / "plan.png"
@@ -236,3 +238,12 @@ def warn_without_floor(folder: RunDir) -> None:
 
     if not folder.load(Ground, "densify").is_found:
         click.echo("Warning: no floor was found in this run, so its grid is not fit to drive on", err=True)
+
+
+def warn_of_doubt(folder: RunDir) -> None:
+    """Say it when a stage found signs that the whole result may be wrong."""
+    from slamcli.slam import doubt
+    from slamcli.stages import NAMES
+
+    if said := doubt.verdict(doubt.from_records({name: folder.record(name) for name in NAMES})):
+        click.echo(f"Warning: {said}", err=True)

@@ -122,18 +122,20 @@ def _mesh(folder: RunDir, voxel: float, even_colours: bool | None) -> Mesh:
 
     from slamcli import console
     from slamcli.dense.tsdf import Volume
-    from slamcli.schema import Ground
+    from slamcli.schema import Ground, Moving
     from slamcli.stages import densify
     from slamcli.stages.depth_frames import depth_poses
 
     config, camera, T_lw = folder.config(), folder.camera("loop"), folder.load(Ground, "densify").T_lw
     option = replace(config.densify, method="tsdf", voxel=voxel)
     poses, read = depth_poses(folder), (folder.dataset(), camera)
-    gains = {}
+    gains, moving = {}, folder.load(Moving, "loop")
     if option.even_colours if even_colours is None else even_colours:
-        gains = densify.colour_gains(*read, console.progress(poses, "colours"), config.sensor, option, workers=config.run.workers)
+        gains = densify.colour_gains(
+            *read, console.progress(poses, "colours"), config.sensor, option, moving=moving, workers=config.run.workers
+        )
     volume = Volume(camera, voxel=voxel, depth_max=option.depth_max)
-    for view in densify.views(*read, console.progress(poses, "mesh"), config.sensor, option, workers=config.run.workers):
+    for view in densify.views(*read, console.progress(poses, "mesh"), config.sensor, option, moving=moving, workers=config.run.workers):
         volume.add(view.seen, view.evened(gains), view.T_wk)
     return volume.mesh().moved(T_lw)
 

@@ -25,6 +25,14 @@ import click
 @click.option("--textured", default=1.0, show_default=True, help="Share of objects and walls with a picture; 0 = plain colours, shaded.")
 @click.option("--dark", is_flag=True, help="No lamp: nothing but noise in the colour images; depth brings its own light.")
 @click.option("--moved-object", "movable", is_flag=True, help="A parcel is taken away half-way.")
+@click.option("--people", type=click.IntRange(0, 20), default=0, show_default=True, help="Figures that walk about in view.")
+@click.option(
+    "--activity",
+    "activities",
+    multiple=True,
+    type=click.Choice(["beside", "cross", "stand", "approach", "sit", "carry"]),
+    help="What they do, in turn; may be repeated. [default: all of these]",
+)
 @click.option(
     "--alias", type=click.Choice(["posters", "corridor"]), default=None, help="Places that look alike: opposite walls, equal doors."
 )
@@ -34,11 +42,12 @@ import click
 def simulate(out: Path, frames: int | None, speed: float | None, turn_rate: float | None, alias: str | None, **settings: Any) -> None:
     """Render a furnished room and a drive through it into the new folder OUT.
 
-    OUT has the TUM layout: colour and depth images, groundtruth.txt (exact), camera.json, and scene.json with every obstacle. The same
-    settings give the same recording.
+    OUT has the TUM layout: colour and depth images, groundtruth.txt (exact), camera.json, and scene.json with every obstacle. With people,
+    moving/ says which pixels of the colour images show one, scene.json how large a share. The same settings give the same recording.
 
     \b
       slamcli simulate room --seed 3
+      slamcli simulate crowd --people 2 --activity beside --activity cross
       slamcli simulate lab --speed 0.15 --turn-rate 0.15 --laps 1 --field-of-view 57 --depth-min 1.2 --depth-max 3.5
       slamcli simulate hand --trajectory fr1_room.txt --stamps fr1_room_stamps.txt
     """

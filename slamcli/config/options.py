@@ -164,6 +164,7 @@ class TrackConfig:
     key_frame_crowd: int = option(12, "no key frame where so many stand within 0.1 m and 6 degrees already", ge=1)
     shape_below: int = option(150, "with fewer landmarks, a frame is aligned by its depth image; 0 = without any", ge=0)
     shape_hold: float = option(1.0, "how long motion continues in directions that depth leaves open, as along a wall [s]", ge=0, le=10)
+    moving_objects: bool = option(True, "find what moves, such as people; poses and maps rest on what stands still")
     share_key_frames: int = option(10, "neighbours in which a new key frame's landmarks are looked for", ge=0)
     share_max_distance: int = option(50, "descriptors that differ more are not one landmark [bits]", ge=1, le=256)
     window_key_frames: int = option(12, "key frames adjusted with each new one", ge=2)

@@ -1,4 +1,4 @@
-"""Simulated recordings: a furnished room, a motion through it and a camera, written in the TUM layout with exact truth."""
+"""Simulated recordings: a furnished room, people in it, a motion through it and a camera, written in the TUM layout with exact truth."""
 
 import json
 from collections.abc import Callable, Iterable
@@ -8,8 +8,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from slamcli.datasets.simulated import drive, noise, room
+from slamcli.datasets.simulated import drive, noise, people, room
 from slamcli.datasets.simulated.drive import Motion
+from slamcli.datasets.simulated.figures import Figure
 from slamcli.datasets.simulated.noise import SensorNoise
 from slamcli.datasets.simulated.scene import Patch, Scene, with_textured_share
 from slamcli.datasets.staging import staged
@@ -24,6 +25,7 @@ DEPTH_SCALE = 5000.0
 TEXEL_AT_640 = 0.004  # [m] finest texture pixel for images 640 px wide: what such a camera resolves at 2 m
 MAX_TEXELS = 30e6
 PATH_MARGIN = 1.35  # [m] of the robot's round from the walls
+MOST_PEOPLE = 20
 AROUND_TRAJECTORY = 1.6  # [m] from a given trajectory to the walls
 PNG_SETTINGS = [cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_SUB]
 
@@ -51,6 +53,8 @@ class Simulation:
     textured: float = 1.0  # share of objects and walls with a picture on them
     dark: bool = False  # nothing but noise in the colour images; depth brings its own light
     movable: bool = False  # a parcel that is gone in the second half
+    people: int = 0  # who walk about in view of the camera
+    activities: tuple[str, ...] = ()  # that they take up in turn; () = all there are
     alias: str = ""  # "posters": opposite walls are the same; "corridor": equal doors
     room: tuple[float, float] = (8.0, 5.0)
     trajectory: Path | None = None  # TUM file to follow instead of driving rounds
@@ -72,11 +76,17 @@ def simulate(out: Path, *, progress: Progress, workers: int = 2, **settings: obj
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise SlamError(f"{out}: exists already; name a new folder")
     scene, motion = build(what)
+    figures = people.populate(
+        motion, scene.low, scene.high, people=what.people, activities=what.activities or tuple(people.ACTIVITIES),
+        drives=what.trajectory is None, seed=what.seed,
+    )  # fmt: skip
     with staged(out) as staging:
         (staging / "rgb").mkdir()
         (staging / "depth").mkdir()
-        _write_lists(staging, what, scene, motion)
-        _write_images(staging, what, scene, motion, progress, workers)
+        if figures:
+            (staging / "moving").mkdir()
+        shares = _write_images(staging, what, scene, motion, figures, progress, workers)
+        _write_lists(staging, what, scene, motion, figures, shares)
     return out
 
 
@@ -135,7 +145,7 @@ def _check(what: Simulation) -> None:
     bounds = {
         "frames": (1, 1_000_000), "laps": (0.01, 1000), "speed": (0.001, 100), "turn_rate": (0.001, 100), "rate": (0.1, 1000),
         "width": (32, 4096), "height": (32, 4096), "field_of_view": (20, 120), "camera_height": (0.1, 2.4), "pitch": (-80, 80),
-        "depth_min": (0, 10), "depth_max": (0.1, 13), "textured": (0, 1), "seed": (0, 2**31),
+        "depth_min": (0, 10), "depth_max": (0.1, 13), "textured": (0, 1), "seed": (0, 2**31), "people": (0, MOST_PEOPLE),
     }  # fmt: skip
     for name, (least, most) in bounds.items():
         value = getattr(what, name)
@@ -143,13 +153,15 @@ def _check(what: Simulation) -> None:
             raise SlamError(f"{name} = {value}: must be from {least} to {most}")
     if what.noise not in ("kinect", "none") or what.alias not in ("", "posters", "corridor"):
         raise SlamError(f"noise = {what.noise!r}, alias = {what.alias!r}: known are noise kinect, none and alias posters, corridor")
+    if unknown := sorted(set(what.activities) - set(people.ACTIVITIES)):
+        raise SlamError(f"activities: {unknown[0]!r} is unknown; known are {', '.join(people.ACTIVITIES)}")
     if what.depth_min >= what.depth_max:
         raise SlamError(f"depth_min = {what.depth_min}, depth_max = {what.depth_max}: the first must be smaller")
     if min(what.room) < 4.0 or max(what.room) > 50.0:
         raise SlamError(f"room = {what.room}: sides must be from 4 to 50 m")
 
 
-def _write_lists(folder: Path, what: Simulation, scene: Scene, motion: Motion) -> None:
+def _write_lists(folder: Path, what: Simulation, scene: Scene, motion: Motion, figures: list[Figure], shares: np.ndarray) -> None:
     for kind, stamps in (("rgb", motion.colour_stamp), ("depth", motion.depth_stamp)):
         lines = [f"{stamp:.6f} {kind}/{stamp:.6f}.png\n" for stamp in stamps]
         (folder / f"{kind}.txt").write_text(f"# simulated {kind} images\n# timestamp filename\n" + "".join(lines))
@@ -166,14 +178,26 @@ def _write_lists(folder: Path, what: Simulation, scene: Scene, motion: Motion) -
         **scene.to_dict(),
         "gone": [{"name": solid.name, "from": gone_from} for solid in scene.solids if solid.is_movable],
     }
+    if figures:
+        about["moving"] = [
+            {"name": figure.name, "type": figure.kind, "value": k + 1, "share": shares[:, k].round(4).tolist()}
+            for k, figure in enumerate(figures)
+        ]
     (folder / "scene.json").write_text(json.dumps(about, indent=1) + "\n")
 
 
-def _write_images(folder: Path, what: Simulation, scene: Scene, motion: Motion, progress: Progress, workers: int) -> None:
+def _write_images(
+    folder: Path, what: Simulation, scene: Scene, motion: Motion, figures: list[Figure], progress: Progress, workers: int
+) -> np.ndarray:
+    """Write colour and depth images, and which pixels of the colour images show figures; returns the shares (F, figures) of these."""
+    from slamcli.datasets.simulated.figure_raycast import Crowd
     from slamcli.datasets.simulated.raycast import Renderer
 
     patches = with_textured_share(scene.patches(), what.textured, what.seed)
-    renderer = Renderer(patches, scene, what.camera(), texel=_texel(patches, what.width))
+    texel = _texel(patches, what.width)
+    renderer = Renderer(patches, scene, what.camera(), texel=texel)
+    crowd = Crowd(figures, what.camera(), texel=texel, seed=what.seed) if figures else None
+    shares = np.zeros((len(motion.colour_stamp), len(figures)))
     n = len(motion.colour_stamp)
     has_one_clock = np.array_equal(motion.colour_stamp, motion.depth_stamp)
     sensor = replace(SensorNoise(), near=what.depth_min, far=what.depth_max)
@@ -183,8 +207,16 @@ def _write_images(folder: Path, what: Simulation, scene: Scene, motion: Motion, 
         rng = np.random.default_rng([what.seed, 3, i])
         shown = i < n // 2
         rgb, depth, cosine = renderer.render(motion.colour_T_lc[i], with_movable=shown)
+        if crowd is not None:
+            drawn = crowd.draw(motion.colour_T_lc[i], motion.colour_stamp[i], rgb, depth, cosine)
+            rgb, depth, cosine = drawn.rgb, drawn.depth, drawn.cosine
+            shares[i] = np.bincount(drawn.owner.ravel(), minlength=len(figures) + 1)[1:] / depth.size
+            _write_png(folder / "moving" / f"{motion.colour_stamp[i]:.6f}.png", drawn.owner)
         if not has_one_clock:
             depth, cosine = renderer.depth(motion.depth_T_lc[i], with_movable=shown)
+            if crowd is not None:
+                drawn = crowd.draw(motion.depth_T_lc[i], motion.depth_stamp[i], rgb, depth, cosine)
+                depth, cosine = drawn.depth, drawn.cosine
         if what.dark:
             rgb = np.zeros_like(rgb)
         if what.noise == "kinect":
@@ -199,6 +231,7 @@ def _write_images(folder: Path, what: Simulation, scene: Scene, motion: Motion, 
 
     for _ in progress(ordered_map(one, range(n), workers=workers), "simulate", n):
         pass
+    return shares
 
 
 def _texel(patches: list[Patch], width: int) -> float:

@@ -91,7 +91,7 @@ def relief(coarse_depth: np.ndarray, camera: Camera, sensor: SensorConfig, *, gi
 
     given : the calibration under which the depth was read, if it was another one
     """
-    small, row_at = _coarse_camera(camera)
+    small, row_at = coarse_camera(camera)
     depth = camera.reread(coarse_depth.astype(np.float32) * np.float32(UNIT), given or camera)
     seen = oriented_points.surface(
         depth, small, settings=CLEANING, stride=1, spacing=0.0, depth_min=sensor.depth_min, depth_max=sensor.depth_max
@@ -109,7 +109,7 @@ def relief(coarse_depth: np.ndarray, camera: Camera, sensor: SensorConfig, *, gi
 
 
 @lru_cache(maxsize=4)
-def _coarse_camera(camera: Camera) -> tuple[Camera, np.ndarray]:
+def coarse_camera(camera: Camera) -> tuple[Camera, np.ndarray]:
     """Give the camera of the coarse images, and which of its raw pixels each pixel of it without distortion shows (h, w), last = none."""
     side, first, width = _blocks(camera.width)
     middle = first + (width - 1) / 2

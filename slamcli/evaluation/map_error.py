@@ -13,7 +13,7 @@ from slamcli.formats import octomap
 from slamcli.geometry import se3
 from slamcli.navigation import grid
 from slamcli.runs.run_directory import RunDir
-from slamcli.schema import Features, Grid, Ground, Map, Tracks, frame_poses
+from slamcli.schema import Features, Grid, Ground, Map, Moving, Tracks, frame_poses
 from slamcli.stages.depth_frames import depth_poses
 from slamcli.stages.octree import scans
 
@@ -28,7 +28,16 @@ def octree_accuracy(run: RunDir, *, progress: Progress) -> dict[str, Any]:
     tree, config = octomap.read(run.stage_path("octree", "map.ot")), run.config()
     T_lw = run.load(Ground, "densify").T_lw
     poses = [(frame, T_lw @ T_wk) for frame, T_wk in depth_poses(run, frames="key")]
-    replay = scans(run.dataset(), run.camera("loop"), progress(poses, "eval map"), config.sensor, config.octree, workers=config.run.workers)
+    moving = run.load(Moving, "loop")
+    replay = scans(
+        run.dataset(),
+        run.camera("loop"),
+        progress(poses, "eval map"),
+        config.sensor,
+        config.octree,
+        moving=moving,
+        workers=config.run.workers,
+    )
     found = occupancy.accuracy(tree, replay, max_range=config.octree.max_range)
     share = float(found.share) if np.isfinite(found.share) else None
     return {"accuracy": share, "correct": found.correct, "wrong": found.wrong, "unknown": found.unknown, "scans": len(poses)}

@@ -8,6 +8,7 @@ import numpy as np
 from slamcli.evaluation.run_content import Content
 from slamcli.runs.staleness import MISSING
 from slamcli.schema import ON_SHAPE, RELOCALISED, TRACKED
+from slamcli.slam import doubt
 
 GOOD, NOTE, BAD = "good", "note", "bad"
 FEW_FEATURES = 150  # in a frame
@@ -32,6 +33,7 @@ def remarks(content: Content, inspected: Sequence[tuple[str, str]] = ()) -> list
     inspected : level ("error", "warning" or "note") and text of each finding on the recording itself
     """
     found = [
+        *_findings(content),
         *_map(content),
         *_poses(content),
         *_features(content),
@@ -43,6 +45,11 @@ def remarks(content: Content, inspected: Sequence[tuple[str, str]] = ()) -> list
         *(Remark(BAD if level == "error" else NOTE, f"Recording: {text}") for level, text in inspected),
     ]
     return sorted(found, key=lambda remark: (BAD, NOTE, GOOD).index(remark.kind))
+
+
+def _findings(content: Content) -> list[Remark]:
+    records = {stage: state.record for stage, state in content.states.items()}
+    return [Remark(BAD if one.is_grave else NOTE, f"{one.text[:1].upper()}{one.text[1:]}.") for one in doubt.from_records(records)]
 
 
 def _map(content: Content) -> list[Remark]:

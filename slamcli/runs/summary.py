@@ -5,6 +5,7 @@ from typing import Any
 
 from slamcli.console import table
 from slamcli.runs.run_directory import RunDir
+from slamcli.slam import doubt
 from slamcli.stages import NAMES
 
 MADE = (  # name, stage, what its summary says of it, where it is
@@ -15,10 +16,11 @@ MADE = (  # name, stage, what its summary says of it, where it is
 
 
 def outcome(run: RunDir) -> str:
-    """Tabulate what was made and where it is; "" while a stage is missing."""
+    """Say first if the result is doubtful, then tabulate what was made and where it is; "" while a stage is missing."""
     records = _records(run)
     if len(records) < len(NAMES):
         return ""
+    said = doubt.verdict(doubt.from_records(records))
     n_warnings = sum(record["n_warnings"] for record in records.values())
     rows = [
         _trajectory(records),
@@ -26,7 +28,7 @@ def outcome(run: RunDir) -> str:
         _cost(records),
         *([["warnings", str(n_warnings), "log.txt"]] if n_warnings else []),
     ]
-    return table(rows)
+    return f"{said}\n" * bool(said) + table(rows)
 
 
 def to_dict(run: RunDir) -> dict[str, Any]:

@@ -102,8 +102,11 @@ class DepthLocalizer:
         return best
 
     def _place(self, i: int, frame: FrameFeatures, kf: int, starts: list[np.ndarray], best: Placement | None) -> Placement | None:
-        """Align frame `i` with key frame `kf`, helped by landmarks where depth leaves directions open; returns the better of this and `best`."""
-        placed = self._shape.place(i, kf, starts)
+        """Align frame `i` with key frame `kf`, helped by landmarks where depth leaves directions open; returns the better of this and `best`.
+
+        starts : T_cw, the first as expected, which counts as measured where the background's motion says so
+        """
+        placed = self._shape.place(i, kf, starts, (starts[0], STEADY) if self._poses.has_background else None)
         if placed is not None and placed.is_sound and placed.n_determined < 6:
             few = self._match_few(frame, placed)
             if few is not None:

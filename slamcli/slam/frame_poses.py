@@ -15,17 +15,26 @@ class FramePoses:
     latest : the last frame with a pose; anchored : the last one of which every direction of motion was measured (-1 before the first)
     """
 
-    def __init__(self, builder: MapBuilder, stamp: np.ndarray) -> None:
-        """Begin with every frame lost; stamp : (F,) [s]."""
+    def __init__(self, builder: MapBuilder, stamp: np.ndarray, background: np.ndarray | None = None) -> None:
+        """Begin with every frame lost.
+
+        stamp : (F,) [s]
+        background : (F, 4, 4) T_wc that drift, but whose motion from frame to frame is right, where it is known beforehand
+        """
         n = len(stamp)
         self._kf = builder.kf
-        self.stamp = stamp
+        self.stamp, self._background = stamp, background
         self.ref_kf = np.full(n, -1, dtype=np.int32)
         self.T_kc = np.full((n, 4, 4), np.nan)
         self.state = np.full(n, LOST, dtype=np.uint8)
         self.n_inliers = np.zeros(n, dtype=np.int32)
         self.lost_reason: dict[int, str] = {}
         self.latest = self.anchored = -1
+
+    @property
+    def has_background(self) -> bool:
+        """Say whether the motion from frame to frame is known beforehand."""
+        return self._background is not None
 
     def tracks(self) -> Tracks:
         """Return the poses of all frames as an artefact."""
@@ -55,11 +64,13 @@ class FramePoses:
         self.ref_kf[i], self.T_kc[i], self.state[i], self.latest, self.anchored = kf, np.eye(4), KEY_FRAME, i, i
 
     def predict(self, i: int, p: int, *, reach: float = STEADY_REACH) -> np.ndarray:
-        """Predict T_cw of frame `i`, assuming that the motion from the frame before `p` to frame `p` goes on at the same speed.
+        """Predict T_cw of frame `i` by the background's motion, else as if that from the frame before `p` to frame `p` went on.
 
         reach : times the time between those two, beyond which the camera is taken to rest where frame `p` saw it
         """
         T_wp = self.T_wc(p)
+        if self._background is not None:
+            return se3.inverse(self._background[i]) @ self._background[p] @ se3.inverse(T_wp)
         if not self.has_pose(p - 1) or self.segment(p - 1) != self.segment(p):
             return se3.inverse(T_wp)
         share = (self.stamp[i] - self.stamp[p - 1]) / (self.stamp[p] - self.stamp[p - 1])

@@ -53,16 +53,17 @@ class Localizer:
         *,
         reliefs: Reliefs = NO_RELIEFS,
         map_reliefs: Reliefs = NO_RELIEFS,
+        background: np.ndarray | None = None,
         make_reference: Callable[[int], int | None] = no_reference,
     ) -> None:
         """Take the map with the index of its key frames, and a recording's features, words and matches of neighbouring frames.
 
         reliefs, map_reliefs : of that recording, and of the one that the map is of; without them, texture alone is followed
-        make_reference : see DepthLocalizer
+        background : see FramePoses; make_reference : see DepthLocalizer
         """
         self._builder, self._features, self._camera = builder, features, camera
         self._settings, self._sensor, self._rng = settings, sensor, rng
-        self.poses = FramePoses(builder, features.stamp)
+        self.poses = FramePoses(builder, features.stamp, background)
         self.previous = PreviousFrame(builder, matches, camera)
         self.shape = Shape(builder, map_reliefs, reliefs)
         self._local_map = LocalMap(builder, camera, settings)

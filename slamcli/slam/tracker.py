@@ -3,6 +3,7 @@
 import numpy as np
 
 from slamcli.config.options import SensorConfig, TrackConfig
+from slamcli.geometry import se3
 from slamcli.geometry.camera import Camera
 from slamcli.schema import KEY_FRAME, ON_SHAPE, TRACKED, Features, Map, Matches, Tracks, Words
 from slamcli.slam import key_frames
@@ -12,6 +13,9 @@ from slamcli.slam.map_growth import MapGrowth
 from slamcli.slam.place_recognition import PlaceIndex
 from slamcli.sparse_map.guided_matching import FrameFeatures
 from slamcli.sparse_map.sparse_map import MapBuilder
+
+# [1/m^2, 1/rad^2] of the background's motion between key frames: within 10 mm and 0.6 degrees.
+BACKGROUND_INFORMATION = 1e4 * np.eye(6)
 
 
 class Tracker:
@@ -32,9 +36,14 @@ class Tracker:
         rng: np.random.Generator,
         *,
         reliefs: Reliefs = NO_RELIEFS,
+        background: np.ndarray | None = None,
     ) -> None:
-        """Take a recording's features, words and matches; without `reliefs`, texture alone is followed."""
-        self._settings = settings
+        """Take a recording's features, words and matches; without `reliefs`, texture alone is followed.
+
+        background : (F, 4, 4) the camera's motion against what stands still, where it was found beforehand: it predicts, and joins key
+            frames
+        """
+        self._settings, self._background = settings, background
         self._builder = MapBuilder(features)
         self._places = PlaceIndex(words, self._builder.kf.frame)
         self._localizer = Localizer(
@@ -49,6 +58,7 @@ class Tracker:
             rng,
             reliefs=reliefs,
             map_reliefs=reliefs,
+            background=background,
             make_reference=self._make_reference,
         )
         self._poses, self._previous = self._localizer.poses, self._localizer.previous
@@ -119,9 +129,20 @@ class Tracker:
         # Landmarks enough to recognize a place by hold the key frame; depth alone might slide along a corridor.
         if self._poses.state[i] == ON_SHAPE and len(known) < self._settings.relocalise_inliers:
             self._localizer.shape.join(kf)
+        if self._background is not None:
+            self._join_by_background(kf, self._background)
         self._poses.make_key_frame(i, kf)
         self._growth.settle(kf, added, known)
         return self._builder.resolve(self._builder.lm_of_row[self._builder.rows_of(kf)])
+
+    def _join_by_background(self, kf: int, T_wb: np.ndarray) -> None:
+        """Add an edge from a key frame to the one before it in its segment, as far apart as the background's motion says."""
+        frame, segment = self._builder.kf.frame, self._builder.kf.segment
+        before = np.flatnonzero(segment[:kf] == segment[kf])
+        if len(before):
+            other = int(before[-1])
+            T_ij = se3.inverse(T_wb[frame[kf]]) @ T_wb[frame[other]]
+            self._builder.add_edge(kf, other, T_ij, BACKGROUND_INFORMATION)
 
     def _make_reference(self, i: int) -> int | None:
         """Make the frame before `i` a key frame that depth can be aligned with; None where its own pose is not fully measured."""

@@ -25,7 +25,7 @@ STAGES = (
     ),
     Stage(
         "loop",
-        ("extract", "match", "optimize"),
+        ("extract", "match", "track", "optimize"),
         ("sensor", "track", "loop"),
         "Recognise revisited places, close the loops and refine every frame.",
     ),

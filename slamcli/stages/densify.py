@@ -15,8 +15,10 @@ from slamcli.depth import oriented_points
 from slamcli.formats.cloud import write_ply, write_ply_mesh
 from slamcli.geometry.camera import Camera
 from slamcli.navigation import floor
+from slamcli.schema import Moving
 from slamcli.stages.contract import Inputs, Summary, Tools
 from slamcli.stages.depth_frames import PosedFrame, depth_poses, read_depth
+from slamcli.stages.moving_parts import NOTHING
 
 SAMPLES_APART = 0.75  # voxels from sample to sample of a near surface: denser ones gain nothing
 FIRST_CAMERA = np.eye(4)  # the world is its frame; the level frame's origin is below it
@@ -28,9 +30,9 @@ def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
     """Find the floor, join the key frames' depth, write `cloud.ply` (and `mesh.ply` where a surface was made) in the floor's frame."""
     camera, option = inputs.camera("loop"), cfg.densify
     poses = depth_poses(inputs)
-    model_w = _model(camera, option)
+    model_w, moving = _model(camera, option), inputs.load(Moving, "loop")
     gains = (
-        colour_gains(inputs.dataset, camera, tools.progress(poses, "colours"), cfg.sensor, option, workers=tools.workers)
+        colour_gains(inputs.dataset, camera, tools.progress(poses, "colours"), cfg.sensor, option, moving=moving, workers=tools.workers)
         if option.even_colours
         else {}
     )
@@ -41,7 +43,7 @@ def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
         nonlocal n_used
         every = -(-len(poses) // GROUND_FRAMES)
         timeline = tools.progress(poses, "densify")
-        for view in views(inputs.dataset, camera, timeline, cfg.sensor, option, workers=tools.workers, warn=tools.warn):
+        for view in views(inputs.dataset, camera, timeline, cfg.sensor, option, moving=moving, workers=tools.workers, warn=tools.warn):
             model_w.add(view.seen, view.evened(gains), view.T_wk)
             n_used += 1
             if n_used % every == 0:
@@ -93,14 +95,21 @@ class View:
 
 
 def colour_gains(
-    dataset: Dataset, camera: Camera, poses: Iterable[PosedFrame], sensor: SensorConfig, option: DensifyConfig, *, workers: int = 1
+    dataset: Dataset,
+    camera: Camera,
+    poses: Iterable[PosedFrame],
+    sensor: SensorConfig,
+    option: DensifyConfig,
+    *,
+    moving: Moving = NOTHING,
+    workers: int = 1,
 ) -> dict[int, np.ndarray]:
     """Find the gains (3,) of each key frame's colours; frames that cannot be read have none."""
     coarse = replace(option, method="voxel", stride=COLOUR_STRIDE)
     frame: list[int] = []
 
     def seen() -> Iterator[tuple[oriented_points.Surface, np.ndarray, np.ndarray]]:
-        for view in views(dataset, camera, poses, sensor, coarse, workers=workers):
+        for view in views(dataset, camera, poses, sensor, coarse, moving=moving, workers=workers):
             frame.append(view.frame)
             yield view.seen, view.rgb, view.T_wk
 
@@ -115,10 +124,11 @@ def views(
     sensor: SensorConfig,
     option: DensifyConfig,
     *,
+    moving: Moving = NOTHING,
     workers: int = 1,
     warn: Callable[[str], None] = lambda message: None,
 ) -> Iterator[View]:
-    """Read and clean frames, in order; one without depth, or that cannot be read, gives no view."""
+    """Read and clean frames, in order, without what moves; one without depth, or that cannot be read, gives no view."""
     is_volume = option.method == "tsdf"
 
     def look(frame: int, depth: np.ndarray, T_wk: np.ndarray) -> View:
@@ -133,4 +143,4 @@ def views(
         )
         return View(frame, T_wk, depth, seen, dataset.rgb(frame))
 
-    return read_depth(dataset, camera, poses, look, workers=workers, warn=warn)
+    return read_depth(dataset, camera, poses, look, moving=moving, workers=workers, warn=warn)

@@ -10,8 +10,9 @@ from slamcli.datasets import Dataset
 from slamcli.errors import BadFrame
 from slamcli.geometry.camera import Camera
 from slamcli.parallel import ordered_map
-from slamcli.schema import Features, Map, Timing, Tracks, frame_poses
+from slamcli.schema import Features, Map, Moving, Timing, Tracks, frame_poses
 from slamcli.stages.contract import Stored
+from slamcli.stages.moving_parts import NOTHING, still_depth
 
 Seen = TypeVar("Seen")
 PosedFrame = tuple[int, np.ndarray]  # a frame's number, and its pose (4, 4), camera to some frame, when its depth was measured
@@ -37,19 +38,20 @@ def read_depth(
     poses: Iterable[PosedFrame],
     look: Callable[[int, np.ndarray, np.ndarray], Seen],
     *,
+    moving: Moving = NOTHING,
     workers: int = 1,
     warn: Callable[[str], None] = lambda message: None,
 ) -> Iterator[Seen]:
     """Read frames' depth images, in order, and hand each to `look(frame, depth, pose)` in a worker thread; yields what that returns.
 
-    depth : (H, W) float32 [m], NaN = none. A frame without depth, or that cannot be read, yields nothing; `warn` is told of the latter.
+    depth : (H, W) float32 [m], NaN = none and where something moves. A frame without depth, or that cannot be read, yields nothing; `warn` is told of the latter.
     """
 
     def seen(posed: PosedFrame) -> Seen | None:
         frame, pose = posed
         try:
             depth = dataset.depth(frame, camera)
-            return None if depth is None else look(frame, depth, pose)
+            return None if depth is None else look(frame, still_depth(depth, moving, frame, camera), pose)
         except BadFrame as error:
             warn(str(error))
             return None

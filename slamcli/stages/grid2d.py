@@ -16,7 +16,7 @@ from slamcli.navigation import grid, own_body
 from slamcli.navigation.driven import mark_driven
 from slamcli.navigation.grid_evidence import View, look
 from slamcli.navigation.robot_pose import planar_pose
-from slamcli.schema import CoarseDepth, Features, Grid, Ground, Map, Tracks, frame_poses
+from slamcli.schema import CoarseDepth, Features, Grid, Ground, Map, Moving, Tracks, frame_poses
 from slamcli.stages.contract import Inputs, Summary, Tools
 from slamcli.stages.depth_frames import PosedFrame, depth_poses, read_depth
 
@@ -50,7 +50,7 @@ def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
 
 
 def _from_depth(inputs: Inputs, T_lw: np.ndarray, cfg: Config, tools: Tools) -> tuple[Grid, int]:
-    option, camera = cfg.grid2d, inputs.camera("loop")
+    option, camera, moving = cfg.grid2d, inputs.camera("loop"), inputs.load(Moving, "loop")
     rays = np.ascontiguousarray(camera.rays)
     has_depth = np.isfinite(inputs.load(Features, "extract").depth_stamp)
     poses = [(frame, T_lw @ T_wd) for frame, T_wd in depth_poses(inputs, frames="all") if has_depth[frame]]
@@ -69,7 +69,7 @@ def _from_depth(inputs: Inputs, T_lw: np.ndarray, cfg: Config, tools: Tools) -> 
     def views() -> Iterator[View]:
         """Hand each view on at once: together their lines of sight would fill much memory."""
         nonlocal n_views
-        for view in read_depth(inputs.dataset, camera, spaced, look_at, workers=tools.workers, warn=tools.warn):
+        for view in read_depth(inputs.dataset, camera, spaced, look_at, moving=moving, workers=tools.workers, warn=tools.warn):
             n_views += 1
             yield view
 

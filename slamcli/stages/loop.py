@@ -14,13 +14,14 @@ from slamcli.config.options import Config
 from slamcli.errors import SlamError
 from slamcli.formats.g2o import write_g2o
 from slamcli.geometry.camera import Camera
-from slamcli.schema import LOST, Closures, CoarseDepth, Features, Map, Timing, Tracks, Words, frame_segments
-from slamcli.slam import final_refinement, loop_closing, map_merging, map_segments
+from slamcli.schema import LOST, Closures, Map, Moving, Timing, Tracks, Words, frame_segments
+from slamcli.slam import doubt, final_refinement, loop_closing, map_merging, map_segments, pose_doubt
 from slamcli.slam.depth_tracking import Reliefs
 from slamcli.slam.loop_closing import Candidate
 from slamcli.slam.place_recognition import PlaceIndex
 from slamcli.sparse_map import map_adjustment
 from slamcli.sparse_map.sparse_map import MapBuilder
+from slamcli.stages import moving_parts
 from slamcli.stages.camera_file import write_camera
 from slamcli.stages.contract import Inputs, Summary, Tools
 from slamcli.stages.map_outputs import describe_other_segments, save_map, segment_file
@@ -31,7 +32,9 @@ def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
     words, tracks = inputs.load(Words, "match"), inputs.load(Tracks, "optimize")
     when, camera = inputs.load(Timing, "optimize"), inputs.camera("optimize")
     given, sensing = inputs.camera(), Sensing(camera, when, {})
-    features = self_calibration.correct(inputs.load(Features, "extract"), given, sensing)
+    moving = inputs.load(Moving, "track")
+    features, depth = moving_parts.still(inputs, moving)
+    features = self_calibration.correct(features, given, sensing)
     builder = MapBuilder.from_map(features, inputs.load(Map, "optimize"))
     tried: list[Candidate] = []
     if cfg.loop.enabled and len(builder.kf) > 2:
@@ -44,7 +47,7 @@ def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
             sensing,
             cfg.sensor,
             cfg.track,
-            reliefs=Reliefs(inputs.load(CoarseDepth, "extract"), given, cfg.sensor),
+            reliefs=Reliefs(depth, given, cfg.sensor),
             shape_edges=cfg.loop.shape_edges,
             shape_weight=cfg.loop.shape_weight,
             iterations=cfg.loop.iterations,
@@ -57,18 +60,28 @@ def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
     for segment, told in enumerate(describe_other_segments(tracks, map_), start=1):
         tools.warn(f"{told}, could not be joined: their poses, in a frame of their own, are in {segment_file(segment)}; no map shows them")
     save_map(out, features.stamp, tracks, map_)
+    moving = moving_parts.find(inputs, tracks, map_, tools) if len(moving.moving) else moving
+    artifacts.save(moving, out)
+    first = inputs.load(Tracks, "track"), inputs.load(Map, "track")
+    doubts = pose_doubt.judge(moving_parts.views(inputs, tracks, map_), moving.moving, first, (tracks, map_))
+    artifacts.save(doubts, out)
     artifacts.save(when, out)
     write_camera(out, camera)
     artifacts.save(closures_of(accepted), out)
-    return {
-        "frames": len(features.stamp),
-        "candidates": len(tried),
-        "closures": len(accepted),
-        "segments": map_segments.n_segments(map_),
-        "lost": int((tracks.state == LOST).sum()),
-        "apart": int((frame_segments(tracks, map_) > 0).sum()),
-        "landmarks": len(map_.lm_xyz),
-    }
+    return (
+        {
+            "frames": len(features.stamp),
+            "candidates": len(tried),
+            "closures": len(accepted),
+            "segments": map_segments.n_segments(map_),
+            "lost": int((tracks.state == LOST).sum()),
+            "apart": int((frame_segments(tracks, map_) > 0).sum()),
+            "landmarks": len(map_.lm_xyz),
+            "doubtful": int(doubts.is_doubtful.sum()),
+        }
+        | moving_parts.told(moving)
+        | doubt.to_summary(pose_doubt.findings(doubts))
+    )
 
 
 def main_first(map_: Map, tracks: Tracks, main: int) -> Map:

@@ -13,9 +13,10 @@ from slamcli.depth import oriented_points
 from slamcli.formats import octomap
 from slamcli.geometry import octree, se3
 from slamcli.geometry.camera import Camera
-from slamcli.schema import Ground
+from slamcli.schema import Ground, Moving
 from slamcli.stages.contract import Inputs, Summary, Tools
 from slamcli.stages.depth_frames import PosedFrame, depth_poses, read_depth
+from slamcli.stages.moving_parts import NOTHING
 
 RAYS_APART = 0.3  # cells from end point to end point on a near surface
 ROUNDS = 2  # of asking the frames between: something may stand before what the first were asked about
@@ -23,12 +24,12 @@ ROUNDS = 2  # of asking the frames between: something may stand before what the 
 
 def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
     """Insert depth images as scans, write `map.ot` and `map.bt`."""
-    option = cfg.octree
+    option, moving, camera = cfg.octree, inputs.load(Moving, "loop"), inputs.camera("loop")
     grid = OccupancyMap(option.resolution, hit=option.hit, miss=option.miss, clamp_min=option.clamp_min, clamp_max=option.clamp_max)
     n_scans = 0
     for poses in rounds(inputs, grid, option):
         progress = tools.progress(poses, "octree")
-        for scan in scans(inputs.dataset, inputs.camera("loop"), progress, cfg.sensor, option, workers=tools.workers, warn=tools.warn):
+        for scan in scans(inputs.dataset, camera, progress, cfg.sensor, option, moving=moving, workers=tools.workers, warn=tools.warn):
             grid.insert(scan.x, scan.origin, max_range=option.max_range, frame=scan.frame)
             n_scans += 1
     cells = grid.leaves()
@@ -72,10 +73,11 @@ def scans(
     sensor: SensorConfig,
     option: OctreeConfig,
     *,
+    moving: Moving = NOTHING,
     workers: int = 1,
     warn: Callable[[str], None] = lambda message: None,
 ) -> Iterator[Scan]:
-    """Read frames' depth, cleaned, as scans in the frame that the poses lead to.
+    """Read frames' depth, cleaned and without what moves, as scans in the frame that the poses lead to.
 
     poses : (frame, camera to that frame when its depth was measured); one without depth, or that cannot be read, gives no scan
     """
@@ -92,4 +94,4 @@ def scans(
         )
         return Scan(se3.transform(T_lk, seen.xyz_c.astype(np.float64)), T_lk[:3, 3], frame)
 
-    return read_depth(dataset, camera, poses, look, workers=workers, warn=warn)
+    return read_depth(dataset, camera, poses, look, moving=moving, workers=workers, warn=warn)

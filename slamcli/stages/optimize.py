@@ -10,11 +10,12 @@ from slamcli import artifacts
 from slamcli.calibration import rolling_shutter, self_calibration
 from slamcli.calibration.self_calibration import Sensing
 from slamcli.config.options import Config
-from slamcli.schema import CoarseDepth, Features, Map, Timing, Tracks
+from slamcli.schema import Features, Map, Moving, Timing, Tracks
 from slamcli.slam import final_refinement, map_segments
 from slamcli.slam.depth_tracking import NO_RELIEFS, Reliefs
 from slamcli.sparse_map import map_adjustment
 from slamcli.sparse_map.sparse_map import MapBuilder
+from slamcli.stages import moving_parts
 from slamcli.stages.camera_file import write_camera
 from slamcli.stages.contract import Inputs, Summary, Tools
 from slamcli.stages.map_outputs import save_map
@@ -22,14 +23,15 @@ from slamcli.stages.map_outputs import save_map
 
 def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
     """Refine key frames, landmarks, what is not known of the camera, and frames, without closures."""
-    features, tracks, map_ = inputs.load(Features, "extract"), inputs.load(Tracks, "track"), inputs.load(Map, "track")
+    tracks, map_ = inputs.load(Tracks, "track"), inputs.load(Map, "track")
+    features, depth = moving_parts.still(inputs, inputs.load(Moving, "track"))
     given = inputs.camera()
     delay = np.array(0.0 if cfg.optimize.move_depth else np.nan)
     still = Timing(np.array(0.0), np.array(0.0), depth_delay=delay, twist=rolling_shutter.frame_twists(features.stamp, tracks, map_))
     sensing, summary = Sensing(given, still, {}), dict[str, Any]()
     if cfg.optimize.enabled and len(map_.kf_frame) > 1:
         builder = MapBuilder.from_map(features, map_)
-        reliefs = Reliefs(inputs.load(CoarseDepth, "extract"), given, cfg.sensor)
+        reliefs = Reliefs(depth, given, cfg.sensor)
         tracks, sensing, summary = refine(builder, features, tracks, sensing, cfg, tools, reliefs=reliefs)
         map_ = map_segments.anchored(builder.snapshot(), tracks)
     save_map(out, features.stamp, tracks, map_)

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from slamcli import artifacts
 from slamcli.config.options import Config
 from slamcli.schema import (
     LOST,
@@ -13,26 +14,32 @@ from slamcli.schema import (
     CoarseDepth,
     Features,
     Matches,
+    Moving,
     Words,
 )
-from slamcli.slam import map_segments
+from slamcli.slam import map_segments, moving_objects
+from slamcli.slam.background_motion import BackgroundMotion
 from slamcli.slam.depth_tracking import Reliefs
 from slamcli.slam.tracker import Tracker
+from slamcli.stages import moving_parts
 from slamcli.stages.contract import Inputs, Summary, Tools
 from slamcli.stages.map_outputs import save_map
+from slamcli.stages.moving_parts import NOTHING
+
+BACKGROUND_ROUNDS = 2  # the second halves the error of the motion from frame to frame, a third does not help
 
 
 def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
-    """Track every frame and build the map of key frames and landmarks."""
-    features = inputs.load(Features, "extract")
-    tracker = Tracker(
-        features, inputs.load(Words, "match"), inputs.load(Matches, "match"), inputs.camera(), cfg.track, cfg.sensor, tools.rng(),
-        reliefs=Reliefs(inputs.load(CoarseDepth, "extract"), inputs.camera(), cfg.sensor),
-    )  # fmt: skip
-    for i in tools.progress(range(len(features.stamp)), "track"):
-        tracker.process(i)
+    """Track every frame and build the map of key frames and landmarks; where things move, once more without them."""
+    features, moving = inputs.load(Features, "extract"), NOTHING
+    tracker = _track(inputs, moving, None, cfg, tools)
+    if cfg.track.moving_objects and moving_parts.are_any(inputs, tracker.tracks(), tracker.map()):
+        moving, background = _find_background(inputs, cfg, tools)
+        tracker = _track(inputs, moving, background, cfg, tools)
+        moving = moving_parts.find(inputs, tracker.tracks(), tracker.map(), tools)
     tracks = tracker.tracks()
     map_ = map_segments.anchored(map_segments.ranked(tracker.map(), tracks), tracks)
+    artifacts.save(moving, out)
     lost = lost_spans(tracks.state, tracker.lost_reason)
     for first, last, reason in lost:
         tools.warn(f"frames {first} to {last} are lost: {reason}" if last > first else f"frame {first} is lost: {reason}")
@@ -48,7 +55,34 @@ def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
         "landmarks": len(map_.lm_xyz),
         "edges": len(map_.edge_kf),
         "lost_spans": [list(span) for span in lost],
-    }
+    } | moving_parts.told(moving)
+
+
+def _find_background(inputs: Inputs, cfg: Config, tools: Tools) -> tuple[Moving, np.ndarray]:
+    """Find how the camera moved against what stands still, T_wc (F, 4, 4) that drift, and what moves under these poses.
+
+    Once most of what moves is known, the motion is found again without it.
+    """
+    words, depth, camera, moving = inputs.load(Words, "match"), inputs.load(CoarseDepth, "extract").coarse_depth, inputs.camera(), NOTHING
+    for _ in range(BACKGROUND_ROUNDS):
+        features, still = moving_parts.still(inputs, moving)
+        motion = BackgroundMotion(features, words, still.coarse_depth, camera, cfg.sensor, tools.rng())
+        T_wc = motion.poses(lambda anchors: tools.progress(anchors, "background"))
+        views = moving_objects.Views(depth, np.asarray(features.stamp), T_wc, np.zeros(len(T_wc), dtype=np.int64), camera)
+        moving = Moving(moving_objects.find(views, lambda frames: tools.progress(frames, "moving objects")))
+    return moving, T_wc
+
+
+def _track(inputs: Inputs, moving: Moving, background: np.ndarray | None, cfg: Config, tools: Tools) -> Tracker:
+    """Track every frame on what does not move."""
+    features, depth = moving_parts.still(inputs, moving)
+    tracker = Tracker(
+        features, inputs.load(Words, "match"), inputs.load(Matches, "match"), inputs.camera(), cfg.track, cfg.sensor, tools.rng(),
+        reliefs=Reliefs(depth, inputs.camera(), cfg.sensor), background=background,
+    )  # fmt: skip
+    for i in tools.progress(range(len(features.stamp)), "track"):
+        tracker.process(i)
+    return tracker
 
 
 def lost_spans(state: np.ndarray, reason: dict[int, str]) -> list[tuple[int, int, str]]:

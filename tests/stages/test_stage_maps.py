@@ -18,7 +18,7 @@ from slamcli.datasets.simulate import Simulation, build, simulate
 from slamcli.dense import occupancy
 from slamcli.formats import cloud, octomap
 from slamcli.geometry import se3
-from slamcli.schema import Features, Ground, Map, Timing, Tracks
+from slamcli.schema import Features, Ground, Map, Moving, Timing, Tracks
 from slamcli.stages import densify, octree
 from slamcli.stages.depth_frames import depth_poses
 
@@ -49,6 +49,7 @@ class Inputs:
         T_kc[frames.stop if frames.stop else n :] = np.nan  # not tracked
         self._records[Tracks] = Tracks(ref_kf, T_kc, none, none)
         self._records[Timing] = Timing(np.array(0.0), np.array(0.0), np.array(0.0), np.zeros((n, 6)))
+        self._records[Moving] = Moving()
         self.runs = runs
 
     def delay_depth(self, seconds: float) -> None:
@@ -290,6 +291,7 @@ class Drive(Inputs):
             Map: Map(kf, 0 * kf, T_wk, none.reshape(0, 3), none.astype("i4"), none.astype("i4"), none.astype("i8")),
             Tracks: Tracks(kf, np.tile(np.eye(4), (n, 1, 1)), none, none),
             Timing: Timing(np.array(0.0), np.array(0.0), np.array(0.0), np.zeros((n, 6))),
+            Moving: Moving(),
         }
         self.dataset = BoxRoom(
             n=n,

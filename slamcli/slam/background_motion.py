@@ -1,0 +1,267 @@
+"""How the camera moved against what stands still, where most of what it sees may move along.
+
+Features that move together say nothing of who moves: somebody walking before the camera shows more of them than the room behind. What
+tells is extent. A person has less than a square metre of surface, a room many. So motions are judged by the surface, in square metres, that
+two depth images show in the same place, less the surface that one sees and the other looks through. From frame to frame the two motions
+differ by less than the noise of what is far; so frames are compared over a third of a second, anchor by anchor, and those between follow.
+
+Motions tried: as before, none, what samples of three matches say (drawn by the surface that each match stands for), and, where none of
+these explains what is seen, a grid around the motion expected. Each is refined by the matches that agree and by depth ICP, near surfaces
+counting less than far ones. M. Fischler, R. Bolles, CACM 1981, doi:10.1145/358669.358692; Y. Chen, G. Medioni, 1992 (depth/icp.py).
+"""
+
+from collections import OrderedDict
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from slamcli.config.options import SensorConfig
+from slamcli.depth import icp, icp_kernels
+from slamcli.depth.icp import Relief
+from slamcli.estimation import camera_pose, minimal_solvers
+from slamcli.estimation.camera_pose import PoseEstimate
+from slamcli.geometry import se3
+from slamcli.geometry.camera import Camera
+from slamcli.schema import Features, Words
+from slamcli.slam import background_motion_kernels as kernels
+from slamcli.sparse_map import map_adjustment
+from slamcli.vision import hamming
+
+SPACING = 0.35  # [s] from anchor to anchor: a walker has gone 0.3 m, ten times the noise of depth at 3 m
+CELLS = 16, 12  # columns and rows of the image that share their surface among the matches in them
+CHI2_SAMPLE, CHI2_AGREE = 9.0, 16.0  # squared distance [sigma^2] of a match that agrees with a sampled motion, and with one to be refined
+SAMPLES, HYPOTHESES = 256, 3  # of three matches; best motions taken in turn, each without the matches of those before
+REFINED = 3  # best motions that are refined
+LEAST = 10  # matches that a refinement needs
+MAX_DISTANCE, RATIO = 64, 0.85  # of descriptors, as in the match stage, a little looser: frames lie farther apart
+FLATNESS = np.array([0.015, 0.006])  # [m, 1/m] distance between surfaces that are the same, and its growth with (z - 0.4)^2
+SWERVE_M, SWERVE_RAD, SWERVE_COST, SWERVE_MOST = 0.08, 0.08, 0.1, 0.3  # change of motion that costs so much of the surface, and at most
+LOOSE = np.array([0.02] * 3 + [0.01] * 3)  # [m, rad] how far ICP may go where no match holds it
+TIGHT = np.array([0.007] * 3 + [0.004] * 3)  # of frames between anchors, whose place is nearly known
+POOR_SHARE, POOR_RATIO = 0.4, 10.0  # surface explained, and how many times what contradicts, below which the grid is searched too
+GRID_M, GRID_RAD = (-0.2, -0.1, 0.0, 0.1, 0.2), (-0.12, 0.0, 0.12)  # forward, and turned to a side
+SCHEDULE = np.array([(4.0, 0.10, 6.0, 5e-4), (2.0, 0.05, 5.0, 2e-4)])  # as of depth/icp.py: with a shorter reach
+NEAR_VARIANCE = 4.0  # [m^2] at which distance squared a reading's variance is as the sensor's; nearer counts less
+FAR = 4.0  # [m] beyond which it does not count more
+KEPT = 48  # reliefs
+
+
+@dataclass(frozen=True)
+class Common:
+    """What two frames have in common: matches and depth."""
+
+    x_r: np.ndarray  # (N, 3) [m] matched points in the reference
+    x_i: np.ndarray  # (N, 3) [m] the same in the frame, NaN where it has no depth
+    xy: np.ndarray  # (N, 2) [px] where the frame sees them
+    depth: np.ndarray  # (N,) [m] there, NaN = none
+    sigma_px: np.ndarray  # (N,)
+    sigma_z: np.ndarray  # (N,) [m]
+    weight: np.ndarray  # (N,) [m^2] surface that each stands for
+    source: Relief  # of the reference
+    target: Relief  # of the frame
+    surface: float  # [m^2] that each shows, on average
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """A motion T_ir from the reference to the frame and what speaks for it, as shares of the surface seen."""
+
+    T: np.ndarray  # (4, 4)
+    score: float
+    explained: float
+    contradicted: float
+    agrees: np.ndarray  # (N,) bool, matches
+
+
+class BackgroundMotion:
+    """Estimates the camera's motion against the static world between frames of a recording."""
+
+    def __init__(
+        self, features: Features, words: Words, depth: np.ndarray, camera: Camera, sensor: SensorConfig, rng: np.random.Generator
+    ) -> None:
+        """Take the features and coarse depth images (F, V, U) of a recording."""
+        self._features, self._words, self._depth, self._camera, self._sensor, self._rng = features, words, depth, camera, sensor, rng
+        self._pinhole = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
+        self._reliefs: OrderedDict[int, Relief] = OrderedDict()
+
+    def poses(self, progress: Callable[[range], Iterable[int]] = iter) -> np.ndarray:
+        """Estimate T_wc (F, 4, 4) of all frames, the first at the origin; local motion is right, drift adds up."""
+        stamp = self._features.stamp
+        anchors = anchor_frames(stamp)
+        T_wc = np.tile(np.eye(4), (len(stamp), 1, 1))
+        for k in progress(range(1, len(anchors))):
+            self._place_anchor(T_wc, anchors[max(k - 2, 0)], anchors[k - 1], anchors[k])
+            for i in range(anchors[k - 1] + 1, anchors[k]):
+                self._place_between(T_wc, anchors[k - 1], anchors[k], i)
+        return T_wc
+
+    def _place_anchor(self, T_wc: np.ndarray, before: int, reference: int, i: int) -> None:
+        """Place an anchor against the one before; the motion between that and an earlier one says what to expect."""
+        common, expected, tried = self._common(reference, i), None, [np.eye(4)]
+        if before < reference:
+            stamp = self._features.stamp
+            share = (stamp[i] - stamp[reference]) / (stamp[reference] - stamp[before])
+            expected = se3.exp(share * se3.log(se3.inverse(T_wc[reference]) @ T_wc[before]))
+            tried.append(expected)
+        tried += self._sampled(common)
+        best = self._best(common, tried, expected, LOOSE, None)
+        if expected is None or best.explained < POOR_RATIO * best.contradicted or best.explained < POOR_SHARE:
+            around = [se3.exp(np.array([0.0, 0.0, z, 0.0, turn, 0.0])) for z in GRID_M for turn in GRID_RAD]
+            start = np.eye(4) if expected is None else expected
+            best = self._best(common, [step @ start for step in around], expected, LOOSE, best)
+        T_wc[i] = T_wc[reference] @ se3.inverse(best.T)
+
+    def _place_between(self, T_wc: np.ndarray, first: int, last: int, i: int) -> None:
+        """Place a frame between two anchors: near where even motion would have it, refined against the nearer."""
+        stamp = self._features.stamp
+        share = (stamp[i] - stamp[first]) / (stamp[last] - stamp[first])
+        reference = first if share < 0.5 else last
+        expected = se3.inverse(se3.interpolate(T_wc[first], T_wc[last], share)) @ T_wc[reference]
+        best = self._best(self._common(reference, i), [expected], expected, TIGHT, None)
+        T_wc[i] = T_wc[reference] @ se3.inverse(best.T)
+
+    def _best(
+        self, common: Common, tried: list[np.ndarray], expected: np.ndarray | None, sigma: np.ndarray, best: Judgement | None
+    ) -> Judgement:
+        """Judge motions, refine the most promising, and return the best of them and of `best`."""
+        judged = sorted((self._judge(common, T, expected) for T in tried), key=lambda judgement: -judgement.score)
+        for start in judged[:REFINED]:
+            for refined in (start, *(self._judge(common, T, expected) for T in self._refined(common, start, sigma))):
+                if best is None or refined.score > best.score:
+                    best = refined
+        assert best is not None
+        return best
+
+    def _judge(self, common: Common, T: np.ndarray, expected: np.ndarray | None) -> Judgement:
+        """Judge a motion by both frames: a surface that comes nearer hides its old place from the one and is looked through by the other."""
+        T = np.ascontiguousarray(T)
+        there = _explain(T, common.source, common.target)
+        back = _explain(np.ascontiguousarray(se3.inverse(T)), common.target, common.source)
+        explained, contradicted = (0.5 * (one + other) for one, other in zip(there, back, strict=True))
+        agrees = np.zeros(len(common.weight), dtype=np.bool_)
+        _, matched = kernels.vote(T[None], *self._votes_of(common, np.arange(len(agrees))), CHI2_AGREE, agrees)
+        cost = 0.0
+        if expected is not None:
+            swerve = se3.log(T @ se3.inverse(expected))
+            cost = min(
+                SWERVE_COST * ((swerve[:3] / SWERVE_M) ** 2).sum() + SWERVE_COST * ((swerve[3:] / SWERVE_RAD) ** 2).sum(), SWERVE_MOST
+            )
+        surface = max(common.surface, 1e-9)
+        score = (explained - contradicted + matched) / surface - cost
+        return Judgement(T, score, explained / surface, contradicted / surface, agrees)
+
+    def _refined(self, common: Common, start: Judgement, sigma: np.ndarray) -> list[np.ndarray]:
+        """Refine a motion by the matches that agree with it, and then by depth too."""
+        T, known, found = start.T, (start.T, np.diag(sigma**-2.0)), []
+        rows = np.flatnonzero(start.agrees)
+        if len(rows) >= LEAST:
+            estimate = self._refined_by_matches(T, common, rows)
+            T, known = estimate.T_cw, (estimate.T_cw, estimate.information)
+            found.append(T)
+        if min(len(common.source), len(common.target)) >= LEAST:
+            found.append(_align(T, common.source, common.target, known))
+        return found
+
+    def _refined_by_matches(self, T: np.ndarray, common: Common, rows: np.ndarray) -> PoseEstimate:
+        c = common
+        return camera_pose.refine_pose(T, c.x_r[rows], c.xy[rows], c.depth[rows], c.sigma_px[rows], c.sigma_z[rows], self._camera)
+
+    def _sampled(self, common: Common) -> list[np.ndarray]:
+        """Draw samples of three matches, take the motion that matches of most surface agree on, leave these out, and again."""
+        found, left = [], np.ones(len(common.weight), dtype=bool)
+        for _ in range(HYPOTHESES):
+            rows = np.flatnonzero(left)
+            whole = rows[np.isfinite(common.x_i[rows, 0])]
+            if len(whole) < LEAST:
+                break
+            bounds = np.cumsum(common.weight[whole])
+            drawn = np.searchsorted(bounds, bounds[-1] * self._rng.random((SAMPLES, 3))).clip(0, len(whole) - 1)
+            T = np.ascontiguousarray(minimal_solvers.rigid3(common.x_r[whole[drawn]], common.x_i[whole[drawn]]))
+            agrees = np.zeros(len(rows), dtype=np.bool_)
+            best, _ = kernels.vote(T, *self._votes_of(common, rows), CHI2_SAMPLE, agrees)
+            if best < 0 or agrees.sum() < LEAST // 2:
+                break
+            found.append(self._refined_by_matches(np.vstack([T[best], [0.0, 0.0, 0.0, 1.0]]), common, rows[agrees]).T_cw)
+            left[rows[agrees]] = False
+        return found
+
+    def _votes_of(self, common: Common, rows: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Gather what the voting kernel takes of matches `rows`."""
+        c = common
+        return c.x_r[rows], c.xy[rows], c.depth[rows], 1.0 / c.sigma_px[rows], 1.0 / c.sigma_z[rows], c.weight[rows], self._pinhole
+
+    def _common(self, reference: int, i: int) -> Common:
+        """Match two frames and gather what both measured."""
+        in_r, in_i = self._matches(reference, i)
+        measured_r, measured_i = (map_adjustment.measure(self._features, rows, self._sensor) for rows in (in_r, in_i))
+        has = np.isfinite(measured_r.depth)
+        xy, depth = measured_i.xy[has], measured_i.depth[has]
+        x_r = self._camera.backproject(measured_r.xy[has], measured_r.depth[has])
+        cell = (xy * np.array(CELLS) / [self._camera.width, self._camera.height]).astype(np.int64).clip(0, np.array(CELLS) - 1)
+        number = cell[:, 1] * CELLS[0] + cell[:, 0]
+        share = np.bincount(number, minlength=CELLS[0] * CELLS[1])[number]
+        cell_rad2 = self._camera.width * self._camera.height / (CELLS[0] * CELLS[1] * self._camera.fx * self._camera.fy)
+        source, target = self._relief(reference), self._relief(i)
+        return Common(
+            x_r=np.ascontiguousarray(x_r),
+            x_i=self._camera.backproject(xy, depth),
+            xy=np.ascontiguousarray(xy),
+            depth=np.ascontiguousarray(depth),
+            sigma_px=np.sqrt(2.0) * measured_i.sigma_px[has],
+            sigma_z=np.hypot(measured_r.sigma_z[has], np.nan_to_num(measured_i.sigma_z[has])),
+            weight=cell_rad2 * x_r[:, 2] ** 2 / np.maximum(share, 1),
+            source=source,
+            target=target,
+            surface=0.5 * sum(kernels.surface(one.xyz, one.normal, one.pinhole) for one in (source, target)),
+        )
+
+    def _matches(self, reference: int, i: int) -> tuple[np.ndarray, np.ndarray]:
+        """Match the features of two frames; returns rows of the table of all features."""
+        first_r, first_i = (int(self._features.offset[frame]) for frame in (reference, i))
+        in_r, in_i = (slice(int(self._features.offset[frame]), int(self._features.offset[frame + 1])) for frame in (reference, i))
+        features, node = self._features, self._words.node
+        row, _ = hamming.match_nodes(
+            features.desc[in_i], node[in_i], features.desc[in_r], node[in_r], features.angle[in_i], features.angle[in_r],
+            max_distance=MAX_DISTANCE, ratio=RATIO, check_rotation=True,
+        )  # fmt: skip
+        return first_r + row[:, 1].astype(np.int64), first_i + row[:, 0].astype(np.int64)
+
+    def _relief(self, frame: int) -> Relief:
+        if frame not in self._reliefs:
+            self._reliefs[frame] = icp.relief(self._depth[frame], self._camera, self._sensor)
+            if len(self._reliefs) > KEPT:
+                self._reliefs.popitem(last=False)
+        return self._reliefs[frame]
+
+
+def anchor_frames(stamp: np.ndarray) -> list[int]:
+    """List frames SPACING apart or just more, the first and the last among them."""
+    anchors = [0]
+    while anchors[-1] < len(stamp) - 1:
+        following = int(np.searchsorted(stamp, stamp[anchors[-1]] + SPACING - 1e-6))
+        anchors.append(min(max(following, anchors[-1] + 1), len(stamp) - 1))
+    return anchors
+
+
+def _explain(T: np.ndarray, source: Relief, target: Relief) -> tuple[float, float]:
+    return kernels.explain(T, source.xyz, source.normal, target.row, target.xyz, target.normal, target.pinhole, FLATNESS[0], FLATNESS[1])
+
+
+def _align(T: np.ndarray, source: Relief, target: Relief, known: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+    """Move the source's surface onto the target's, all surface counting alike; `known` as in icp.align."""
+    T = np.array(T, dtype=np.float64, order="C")
+    H, b = np.zeros((6, 6)), np.zeros(6)
+    pull = known[1] @ se3.log(known[0] @ se3.inverse(T))
+    icp_kernels.align(
+        T, source.xyz, source.normal, _variance(source), target.row, target.xyz, target.normal, _variance(target), target.pinhole,
+        SCHEDULE, icp.MIN_COSINE, icp.HUBER_CHI2, icp.READINGS_AS_ONE, np.ascontiguousarray(known[1]), pull, H, b,
+    )  # fmt: skip
+    return se3.orthonormalise(T)
+
+
+def _variance(relief: Relief) -> np.ndarray:
+    """Give readings (N,) weights as of the surface that they stand for, which grows with the square of the distance."""
+    z = relief.xyz[:, 2]
+    sigma = np.sqrt(relief.variance) + np.float32(0.005)
+    return np.square(sigma) * np.float32(NEAR_VARIANCE) / np.square(np.minimum(z, np.float32(FAR)))

@@ -1,0 +1,139 @@
+"""Kernels of moving_objects.py: depth images compared under known poses, and groups and regions of places."""
+
+import numpy as np
+from numba import b1, f4, f8, i4, i8, u1, u2
+
+from slamcli.jit.kernel import kernel
+
+UNKNOWN, THROUGH, AGAIN, HIDDEN = range(4)  # what another view says of a place
+Z_MIN = 0.3  # [m] nearer than this a camera sees nothing
+
+
+@kernel
+def smooth_places(z: f4[:, ::1], jump: f8):
+    """Find the places of a depth image (V, U) [m], 0 = none, whose eight neighbours are known and differ by at most `jump` of the depth."""
+    rows, columns = z.shape
+    out = np.zeros((rows, columns), np.bool_)
+    for row in range(1, rows - 1):
+        for column in range(1, columns - 1):
+            here = z[row, column]
+            is_smooth = here > 0.0
+            for r in range(row - 1, row + 2):
+                for c in range(column - 1, column + 2):
+                    if z[r, c] == 0.0 or abs(z[r, c] - here) > jump * here:
+                        is_smooth = False
+            out[row, column] = is_smooth
+    return out
+
+
+@kernel
+def compare(
+    z: f4[:, ::1], is_smooth: b1[:, ::1], step: i8, others: u2[:, :, ::1], place: i4[:, ::1], T: f8[:, :, ::1], pinhole: f8[::1],
+    tolerance: f8[::1], unit: f8, out: u1[:, :, ::1],
+):  # fmt: skip
+    """Look from other views at the places of one depth image (V, U) [m]; write THROUGH, AGAIN, HIDDEN or UNKNOWN.
+
+    is_smooth : (V, U) places that may be compared, of which every `step`-th row and column is
+    others : (N, V, U) raw coarse images, times `unit` [m], 0 = none; place : (V, U) where in them a place without distortion is, -1 = nowhere
+    T : (N, 4, 4) from this camera to theirs; tolerance : base [m], share of the depth, growth with its square [1/m]
+    out : (N, v, u)
+
+    A view looks through a place when all it sees around there is farther.
+    """
+    fx, fy, cx, cy = pinhole
+    rows, columns = z.shape
+    for k in range(len(others)):
+        other, t = others[k].ravel(), T[k]
+        for v in range(out.shape[1]):
+            for u in range(out.shape[2]):
+                row, column = v * step + step // 2, u * step + step // 2
+                if not is_smooth[row, column]:
+                    continue
+                d = z[row, column]
+                x, y = (column - cx) / fx * d, (row - cy) / fy * d
+                depth = t[2, 0] * x + t[2, 1] * y + t[2, 2] * d + t[2, 3]
+                if depth < Z_MIN:
+                    continue
+                c = int(np.floor(fx * (t[0, 0] * x + t[0, 1] * y + t[0, 2] * d + t[0, 3]) / depth + cx + 0.5))
+                r = int(np.floor(fy * (t[1, 0] * x + t[1, 1] * y + t[1, 2] * d + t[1, 3]) / depth + cy + 0.5))
+                if r < 1 or c < 1 or r >= rows - 1 or c >= columns - 1 or place[r, c] < 0:
+                    continue
+                seen = other[place[r, c]] * unit
+                if seen == 0.0:
+                    continue
+                far = max(depth, seen) - 0.4
+                allowed = tolerance[0] + tolerance[1] * depth + tolerance[2] * far * far
+                if seen < depth - allowed:
+                    out[k, v, u] = HIDDEN
+                elif seen <= depth + allowed:
+                    out[k, v, u] = AGAIN
+                elif _is_farther(other, place, r, c, (depth + allowed) / unit):
+                    out[k, v, u] = THROUGH
+
+
+@kernel
+def _is_farther(other, place, row, column, limit):
+    """Say whether all around a place of a raw coarse image is known and farther than a limit."""
+    for r in range(row - 1, row + 2):
+        for c in range(column - 1, column + 2):
+            if place[r, c] < 0 or other[place[r, c]] < limit:
+                return False
+    return True
+
+
+@kernel
+def groups(seed: b1[:, ::1], z: f4[:, ::1], jump: f8, least: i8):
+    """Keep of the seeds (v, u) those in connected groups of at least `least`; neighbours are connected where depth is continuous."""
+    rows, columns = seed.shape
+    out = np.zeros((rows, columns), np.bool_)
+    open_ = seed.copy()
+    stack = np.empty(rows * columns, np.int32)
+    for start in range(rows * columns):
+        if not open_[start // columns, start % columns]:
+            continue
+        open_[start // columns, start % columns] = False
+        stack[0] = start
+        n = _spread(open_, z, jump, stack, 1, rows * columns)
+        if n >= least:
+            for k in range(n):
+                out[stack[k] // columns, stack[k] % columns] = True
+    return out
+
+
+@kernel
+def grow(seed: b1[:, ::1], is_open: b1[:, ::1], z: f4[:, ::1], jump: f8, most: i8):
+    """Grow a region (v, u) over open neighbours to which depth is continuous, by `most` places at most."""
+    rows, columns = seed.shape
+    open_ = is_open & ~seed
+    stack = np.empty(rows * columns, np.int32)
+    n = 0
+    for k in range(rows * columns):
+        if seed[k // columns, k % columns]:
+            stack[n] = k
+            n += 1
+    n = _spread(open_, z, jump, stack, n, most)
+    out = np.zeros((rows, columns), np.bool_)
+    for k in range(n):
+        out[stack[k] // columns, stack[k] % columns] = True
+    return out
+
+
+@kernel
+def _spread(open_, z, jump, stack, n, most):
+    """Take open neighbours of the `n` places on the stack, and theirs, `most` times, onto it and close them; return how many it holds then."""
+    rows, columns = open_.shape
+    read, end, done = 0, n, 0
+    while read < n:
+        if read == end:
+            end, done = n, done + 1
+        if done == most:
+            break
+        r, c = stack[read] // columns, stack[read] % columns
+        read += 1
+        for rr in range(max(r - 1, 0), min(r + 2, rows)):
+            for cc in range(max(c - 1, 0), min(c + 2, columns)):
+                if open_[rr, cc] and abs(z[rr, cc] - z[r, c]) <= jump * z[r, c]:
+                    open_[rr, cc] = False
+                    stack[n] = rr * columns + cc
+                    n += 1
+    return n

@@ -1,0 +1,88 @@
+"""How far each frame's pose can be trusted, by signs that do not depend on one another.
+
+* Other views look through what a frame sees: things moved that were not found, or the pose is wrong. Poses that are right leave next to
+  nothing of it, poses that follow somebody through a room a tenth of all surface and more.
+* Tracking and the final pass disagree about the motion within half a second.
+* Few landmarks hold the pose, or it is unknown.
+* Most of the view moves.
+"""
+
+import numpy as np
+
+from slamcli.geometry import se3
+from slamcli.schema import Doubt, Map, Tracks, frame_poses, frame_segments
+from slamcli.slam import doubt, moving_objects
+from slamcli.slam.doubt import Finding
+from slamcli.slam.moving_objects import Views
+
+EVERY = 4  # frames from one whose view is compared with others to the next
+SPAN = 0.5  # [s] of the motion that tracking and the final pass are compared over
+LANDMARK_SIGMA = 0.3  # [m] standard deviation of a pose is about this over the number of landmarks: 3 mm with 100
+BASE_SIGMA, WORST_SIGMA = 0.002, 0.05  # [m] at best; where fewer than six landmarks hold the pose
+CONTRADICTED = 0.03  # share of the surface; right poses leave 0.01 on real recordings, wrong ones 0.06 and more
+DISAGREEMENT = 0.03  # [m]
+DOUBTFUL_SIGMA = 0.03  # [m]
+MOVING = 0.6  # share of a view
+
+
+def judge(views: Views, moving: np.ndarray, first: tuple[Tracks, Map], final: tuple[Tracks, Map]) -> Doubt:
+    """Weigh the signs for every frame.
+
+    views : with the final poses; moving : (F, v, u) bool, without rows where nothing moves
+    first, final : the poses of tracking and of the final pass
+    """
+    tracks, n = final[0], len(views.stamp)
+    contradicted = _contradicted(views, moving)
+    disagreement = _disagreement(views.stamp, first, final)
+    share = moving.mean(axis=(1, 2)) if len(moving) else np.zeros(n)
+    support = np.minimum(LANDMARK_SIGMA / np.maximum(tracks.n_inliers, 1), WORST_SIGMA)
+    sigma = np.sqrt(BASE_SIGMA**2 + support**2 + np.nan_to_num(disagreement) ** 2)
+    is_doubtful = (sigma > DOUBTFUL_SIGMA) | (np.nan_to_num(contradicted) > CONTRADICTED) | (share > MOVING) | (tracks.ref_kf < 0)
+    is_doubtful |= np.nan_to_num(disagreement) > DISAGREEMENT
+    sigma = np.where(tracks.ref_kf >= 0, sigma, np.nan)
+    return Doubt(
+        contradicted=contradicted.astype(np.float32),
+        disagreement=disagreement.astype(np.float32),
+        sigma=sigma.astype(np.float32),
+        is_doubtful=is_doubtful,
+    )
+
+
+def findings(record: Doubt) -> list[Finding]:
+    """Sum up what the frames' signs say of the run."""
+    n = int(record.is_doubtful.sum())
+    if n == 0:
+        return []
+    share, contradicted = n / len(record.is_doubtful), float(np.nanmean(np.append(record.contradicted, 0.0)))
+    text = f"the poses of {n} of {len(record.is_doubtful)} frames are doubtful"
+    if contradicted > CONTRADICTED:
+        text += f", as other views look through {contradicted:.0%} of what is seen: much moves, or the poses are wrong"
+    return [Finding("poses", f"{text}; slamcli report shows which", is_grave=share >= doubt.MANY)]
+
+
+def _contradicted(views: Views, moving: np.ndarray) -> np.ndarray:
+    """Find the share (F,) of the surface that other views look through, what is known to move left out; every few frames anew."""
+    share = np.full(len(views.stamp), np.nan)
+    for frame in range(0, len(share), EVERY):
+        evidence = moving_objects.weigh(views, frame, moving_objects.QUICK_AFTER)
+        if evidence is None:
+            continue
+        area = evidence.depth**2 if len(moving) == 0 else np.where(moving_objects.with_margin(moving[frame]), 0.0, evidence.depth**2)
+        against = area[(evidence.n_through > 0) & (evidence.n_through >= evidence.n_still)].sum()
+        agreed = area[evidence.n_still > evidence.n_through].sum()
+        share[frame : frame + EVERY] = against / (against + agreed) if against + agreed > 0 else np.nan
+    return share
+
+
+def _disagreement(stamp: np.ndarray, first: tuple[Tracks, Map], final: tuple[Tracks, Map]) -> np.ndarray:
+    """Find by how much (F,) [m] two passes differ about the motion from SPAN before to each frame, NaN where one does not know it."""
+    later = np.arange(len(stamp))
+    before = np.minimum(np.searchsorted(stamp, stamp - SPAN), later)
+    motion = []
+    for tracks, map_ in (first, final):
+        segment, T_wc = frame_segments(tracks, map_), np.full((len(stamp), 4, 4), np.nan)
+        for number in np.unique(segment[segment >= 0]):
+            T_wc[segment == number] = frame_poses(tracks, map_, int(number))[segment == number]
+        T_wc[before[segment != segment[before]]] = np.nan
+        motion.append(se3.inverse(T_wc[before]) @ T_wc)
+    return np.linalg.norm((se3.inverse(motion[0]) @ motion[1])[:, :3, 3], axis=1)

@@ -1,0 +1,51 @@
+"""What moves in the recording, as the stages share it: found under the poses of a stage, and left out of what others read."""
+
+import numpy as np
+
+from slamcli.geometry.camera import Camera
+from slamcli.schema import CoarseDepth, Features, Map, Moving, Tracks, frame_poses, frame_segments
+from slamcli.slam import moving_objects
+from slamcli.slam.moving_objects import Views
+from slamcli.stages.contract import Inputs, Summary, Tools
+
+NOTHING = Moving()
+MOVES = 0.01  # share of a view, from which on a frame counts as one with moving objects in the summary
+
+
+def are_any(inputs: Inputs, tracks: Tracks, map_: Map) -> bool:
+    """Say whether anything moves in the recording, seen from these poses; nothing does where depth is missing."""
+    seen = views(inputs, tracks, map_)
+    return seen.depth.size > 0 and moving_objects.is_any(seen)
+
+
+def find(inputs: Inputs, tracks: Tracks, map_: Map, tools: Tools) -> Moving:
+    """Find what moves in every frame, seen from these poses."""
+    found = moving_objects.find(views(inputs, tracks, map_), lambda frames: tools.progress(frames, "moving objects"))
+    return Moving(found) if found.any() else Moving()
+
+
+def still(inputs: Inputs, moving: Moving) -> tuple[Features, CoarseDepth]:
+    """Return the recording's features and coarse depth without what moves."""
+    features, depth, camera = inputs.load(Features, "extract"), inputs.load(CoarseDepth, "extract"), inputs.camera()
+    return moving_objects.hide_features(features, moving.moving, camera), moving_objects.hide_coarse(depth, moving.moving, camera)
+
+
+def still_depth(depth: np.ndarray, moving: Moving, frame: int, camera: Camera) -> np.ndarray:
+    """Return a frame's depth image (H, W) [m] without what moves and a margin around it."""
+    return moving_objects.hide_pixels(depth, moving.moving[frame], camera) if len(moving.moving) else depth
+
+
+def told(moving: Moving) -> Summary:
+    """Tell how much moves: frames in which something does, and the mean share of their views."""
+    share = moving.moving.mean(axis=(1, 2)) if len(moving.moving) else np.zeros(0)
+    moves = share[share > MOVES]
+    return {"frames_with_motion": len(moves), "share_that_moves": float(moves.mean())} if len(moves) else {}
+
+
+def views(inputs: Inputs, tracks: Tracks, map_: Map) -> Views:
+    """Gather the coarse depth images with these poses."""
+    features, world = inputs.load(Features, "extract"), frame_segments(tracks, map_)
+    T_wc = np.full((len(world), 4, 4), np.nan)
+    for segment in np.unique(world[world >= 0]):
+        T_wc[world == segment] = frame_poses(tracks, map_, int(segment))[world == segment]
+    return Views(inputs.load(CoarseDepth, "extract").coarse_depth, np.asarray(features.stamp), T_wc, world, inputs.camera())

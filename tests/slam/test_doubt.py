@@ -1,0 +1,39 @@
+"""Findings: kept in a stage's summary, collected, summed up."""
+
+import json
+
+import numpy as np
+import pytest
+
+from slamcli.slam import doubt
+from slamcli.slam.doubt import Finding
+
+GRAVE = Finding("focal_length", "the focal length does not fit by 8 %: give the right camera.json", is_grave=True)
+MILD = Finding("moving_objects", "a third of the views moves in 20 frames")
+
+
+def test_findings_survive_the_record_and_grave_ones_come_first() -> None:
+    records = {
+        "track": {"summary": json.loads(json.dumps({"frames": 3} | doubt.to_summary([MILD])))},
+        "optimize": None,
+        "loop": {"summary": doubt.to_summary([GRAVE, MILD])},
+        "octree": {},
+    }
+    assert doubt.from_records(records) == [GRAVE, MILD]
+
+
+def test_without_findings_a_summary_has_no_word_of_doubt() -> None:
+    assert doubt.to_summary([]) == {} and doubt.from_records({"track": {"summary": {}}}) == []
+
+
+def test_only_grave_findings_put_the_whole_in_doubt() -> None:
+    assert doubt.verdict([MILD]) == ""
+    said = doubt.verdict([MILD, GRAVE])
+    assert GRAVE.text in said and MILD.text not in said and "\n" not in said
+
+
+@pytest.mark.parametrize(
+    ("frames", "stretches"), [([], []), ([0, 0], []), ([1, 1, 0, 1], [(0, 1), (3, 3)]), ([0, 1, 1, 1], [(1, 3)]), ([1], [(0, 0)])]
+)  # fmt: skip
+def test_stretches_cover_exactly_the_doubtful_frames(frames: list[int], stretches: list) -> None:
+    assert doubt.doubtful_frames(np.array(frames, dtype=bool)) == stretches

@@ -1,0 +1,204 @@
+"""What moves: somebody walks before a camera through the analytic room; the truth is what the walker hides."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from boxroom import FURNITURE, KINECT, look_along, render
+from scipy import ndimage
+
+from slamcli.config.options import SensorConfig
+from slamcli.depth import icp
+from slamcli.geometry import se3
+from slamcli.schema import CoarseDepth, Features, Words
+from slamcli.slam import background_motion_kernels, moving_object_kernels, moving_objects
+from slamcli.slam.background_motion import BackgroundMotion, anchor_frames
+from slamcli.slam.moving_objects import STEP, Views
+
+FRAMES, RATE, SPEED = 36, 15.0, 0.6
+WIDTH, NEAR, TALL = 0.55, 1.2, 1.3  # [m] of the walker, before the camera, and its height
+
+
+def camera_at(i: int) -> np.ndarray:
+    return look_along([1.2 + SPEED * i / RATE, 2.9 - 0.01 * i, 0.9], 0.02 * np.sin(i / 5), 0.15)
+
+
+def walker(i: int) -> tuple:
+    """A box that keeps before the camera, swaying from side to side."""
+    x, y = 1.2 + SPEED * i / RATE + NEAR, 2.9 + 0.2 * np.sin(i / 6)
+    return (x, y - WIDTH / 2, 0.0), (x + 0.3, y + WIDTH / 2, TALL)
+
+
+@cache
+def recording(who: str) -> tuple[Views, np.ndarray]:
+    """Views of the room with nobody, somebody who walks, or somebody who stands in it; and the places (F, v, u) that show somebody."""
+    depth, masks = [], []
+    for i in range(FRAMES):
+        boxes = {"nobody": (), "walking": (walker(i),), "standing": (walker(12),)}[who]
+        T_lc = camera_at(i)
+        seen, empty = render(T_lc, KINECT, boxes=(*FURNITURE, *boxes)), render(T_lc, KINECT)
+        depth.append(icp.coarse(seen))
+        masks.append((seen < empty - 1e-3)[STEP // 2 :: STEP, STEP // 2 :: STEP])
+    T_wc = np.array([camera_at(i) for i in range(FRAMES)])
+    return Views(np.array(depth), np.arange(FRAMES) / RATE, T_wc, np.zeros(FRAMES, dtype=np.int64), KINECT), np.array(masks)
+
+
+def test_a_walker_is_found_and_next_to_nothing_else() -> None:
+    views, truth = recording("walking")
+    assert moving_objects.is_any(views)
+    found = moving_objects.find(views)
+    recall = np.array([(a & b).sum() / b.sum() for a, b in zip(found, truth, strict=True)])
+    false = np.array([(a & ~b).sum() / (~b).sum() for a, b in zip(found, truth, strict=True)])
+    assert truth.mean() > 0.2
+    assert np.median(recall) > 0.9 and recall.min() > 0.5
+    assert np.median(false) < 0.02 and false.max() < 0.25
+
+
+@pytest.mark.parametrize("who", ["nobody", "standing"])
+def test_what_stands_still_while_it_is_seen_is_kept(who: str) -> None:
+    views, _ = recording(who)
+    assert not moving_objects.is_any(views) and not moving_objects.find(views).any()
+
+
+def test_nothing_is_said_under_unknown_or_wholly_wrong_poses() -> None:
+    views, _ = recording("walking")
+    lost = replace(views, T_wc=np.full_like(views.T_wc, np.nan))
+    assert not moving_objects.find(lost).any()
+    apart = replace(views, world=np.arange(FRAMES))
+    assert not moving_objects.find(apart).any()
+    # Believed to rest, the camera sees the walker rest and the room come nearer: most of the room seems to move, which cannot be.
+    still = replace(views, T_wc=np.tile(np.eye(4), (FRAMES, 1, 1)))
+    _, truth = recording("walking")
+    assert (moving_objects.find(still) & ~truth).mean() < 0.6
+
+
+def test_hiding_takes_away_what_is_marked_and_no_more() -> None:
+    views, _ = recording("walking")
+    rows, columns = moving_objects.shape(KINECT)
+    moving = np.zeros((FRAMES, rows, columns), dtype=bool)
+    moving[3, 20:30, 30:40] = True
+    xy = np.array([[70.0, 50.0], [10.0, 10.0], [70.0, 50.0]], dtype=np.float32)  # the first is in the middle of what moves
+    offset = np.zeros(FRAMES + 1, dtype=np.int64)
+    offset[4:], offset[5:] = 2, 3
+    features = Features(
+        stamp=views.stamp, depth_stamp=views.stamp, offset=offset, xy=xy, depth=np.ones(3, np.float32), slope=np.zeros((3, 2), np.float32),
+        octave=np.zeros(3, np.uint8), angle=np.zeros(3, np.float32), desc=np.zeros((3, 32), np.uint8), octave_scale=np.float64(1.2),
+    )  # fmt: skip
+    hidden = moving_objects.hide_features(features, moving, KINECT)
+    assert np.isnan(hidden.depth).tolist() == [True, False, False] and (hidden.xy[0] < -1000).all()
+    np.testing.assert_array_equal(hidden.xy[1:], xy[1:])
+    coarse = moving_objects.hide_coarse(CoarseDepth(views.depth), moving, KINECT).coarse_depth
+    changed = coarse != views.depth
+    assert (coarse[3, 42:58, 62:78] == 0).all() and changed[3].sum() <= 24 * 24 and not changed[:3].any() and not changed[4:].any()
+    pixels = moving_objects.hide_pixels(np.ones((120, 160), np.float32), moving[3], KINECT)
+    assert np.isnan(pixels[42:58, 62:78]).all() and np.isfinite(pixels[:36]).all()
+    assert moving_objects.hide_features(features, np.zeros((0, 0, 0), bool), KINECT) is features
+
+
+def test_the_motion_of_the_room_is_found_where_somebody_walks_along() -> None:
+    """Depth alone, no feature at all: half of the view keeps its place before the camera."""
+    views, truth = recording("walking")
+    assert truth.mean() > 0.2
+    empty = {"xy": (0, 2), "depth": (0,), "slope": (0, 2), "octave": (0,), "angle": (0,), "desc": (0, 32)}
+    kinds = {"octave": np.uint8, "desc": np.uint8}
+    features = Features(
+        stamp=views.stamp, depth_stamp=views.stamp, offset=np.zeros(FRAMES + 1, np.int64), octave_scale=np.float64(1.2),
+        **{name: np.zeros(size, kinds.get(name, np.float32)) for name, size in empty.items()},
+    )  # fmt: skip
+    words = Words(np.ones(1, np.float32), np.zeros(0, np.int32), np.zeros((0, 2), np.int32), np.zeros(FRAMES + 1, np.int64),
+                  np.zeros(0, np.int32), np.zeros(0, np.float32))  # fmt: skip
+
+    def poses() -> np.ndarray:
+        return BackgroundMotion(features, words, views.depth, KINECT, SensorConfig(), np.random.default_rng(0)).poses()
+
+    found = poses()
+    np.testing.assert_array_equal(found, poses())
+    true = se3.inverse(views.T_wc[0]) @ views.T_wc
+    error = np.linalg.norm(found[:, :3, 3] - true[:, :3, 3], axis=1)
+    assert np.linalg.norm(true[-1, :3, 3]) > 1.3 and error.max() < 0.08
+
+
+def test_the_room_speaks_for_its_own_motion_by_its_extent() -> None:
+    views, _ = recording("walking")
+    source, target = (icp.relief(views.depth[i], KINECT, SensorConfig()) for i in (10, 16))
+    true, followed = se3.inverse(views.T_wc[16]) @ views.T_wc[10], np.eye(4)
+
+    def explain(T: np.ndarray) -> tuple[float, float]:
+        return background_motion_kernels.explain(
+            np.ascontiguousarray(T), source.xyz, source.normal, target.row, target.xyz, target.normal, target.pinhole, 0.015, 0.006
+        )
+
+    surface = background_motion_kernels.surface(source.xyz, source.normal, source.pinhole)
+    (right, against_right), (wrong, against_wrong) = explain(true), explain(followed)
+    assert right - against_right > 2 * max(wrong - against_wrong, 0.0) and right < surface and against_wrong > against_right
+
+
+def test_votes_are_counted_as_by_hand() -> None:
+    rng = np.random.default_rng(1)
+    x = rng.uniform([-1, -1, 1], [1, 1, 4], (60, 3))
+    T = np.array([np.eye(4), se3.exp(np.array([0.1, 0.0, 0.05, 0.0, 0.02, 0.0]))])
+    moved = se3.transform(T[1], x)
+    moved[:20] = x[:20]
+    pinhole = np.array([150.0, 150.0, 80.0, 60.0])
+    xy = moved[:, :2] / moved[:, 2:] * pinhole[:2] + pinhole[2:] + rng.normal(0, 0.5, (60, 2))
+    depth, weight = moved[:, 2] + rng.normal(0, 0.01, 60), rng.uniform(0.5, 2.0, 60)
+    depth[::7] = np.nan
+    agrees = np.zeros(60, dtype=np.bool_)
+    best, total = background_motion_kernels.vote(
+        T, x, np.ascontiguousarray(xy), depth, np.full(60, 1.0), np.full(60, 50.0), weight, pinhole, 9.0, agrees
+    )
+    expected = []
+    for pose in T:
+        y = se3.transform(pose, x)
+        e = ((y[:, :2] / y[:, 2:] * pinhole[:2] + pinhole[2:] - xy) ** 2).sum(axis=1)
+        e += np.nan_to_num((y[:, 2] - depth) * 50.0) ** 2
+        expected.append(e < 9.0)
+    sums = [weight[one].sum() for one in expected]
+    assert best == np.argmax(sums) == 1 and total == pytest.approx(max(sums))
+    np.testing.assert_array_equal(agrees, expected[1])
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_groups_and_regions_are_those_of_scipy(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    seed_places, flat = rng.random((40, 50)) < 0.35, np.ones((40, 50), np.float32)
+    label, n = ndimage.label(seed_places, structure=np.ones((3, 3)))
+    size = ndimage.sum_labels(seed_places, label, np.arange(n + 1))
+    np.testing.assert_array_equal(moving_object_kernels.groups(seed_places, flat, 0.1, 12), seed_places & (size >= 12)[label])
+    start = np.zeros_like(seed_places)
+    start[20:23, 20:23] = True
+    for most in (1, 3, 100):
+        grown = ndimage.binary_dilation(start, structure=np.ones((3, 3)), iterations=most, mask=seed_places | start)
+        np.testing.assert_array_equal(moving_object_kernels.grow(start, seed_places, flat, 0.1, most), grown)
+
+
+def test_a_region_stops_where_depth_jumps() -> None:
+    z = np.ones((10, 20), np.float32)
+    z[:, 12:] = 1.5
+    start, everywhere = np.zeros((10, 20), bool), np.ones((10, 20), bool)
+    start[5, 2] = True
+    grown = moving_object_kernels.grow(start, everywhere, z, 0.1, 100)
+    assert grown[:, :12].all() and not grown[:, 12:].any()
+
+
+@pytest.mark.parametrize(("seen", "said"), [(1.0, "AGAIN"), (1.6, "THROUGH"), (0.6, "HIDDEN"), (0.0, "UNKNOWN"), (1.05, "AGAIN")])
+def test_what_another_view_says_of_a_wall(seen: float, said: str) -> None:
+    z = np.ones((12, 16), np.float32)
+    others = np.full((1, 12, 16), round(seen / icp.UNIT), np.uint16)
+    place = np.arange(12 * 16, dtype=np.int32).reshape(12, 16)
+    out = np.zeros((1, 6, 8), np.uint8)
+    smooth = moving_object_kernels.smooth_places(z, 0.06)
+    assert smooth[1:-1, 1:-1].all() and not smooth[0].any()
+    moving_object_kernels.compare(
+        z, smooth, 2, others, place, np.eye(4)[None], np.array([15.0, 15.0, 7.5, 5.5]), np.array([0.06, 0.02, 0.008]), icp.UNIT, out
+    )
+    assert set(np.unique(out[0, :-1, :-1])) == {getattr(moving_object_kernels, said)}
+
+
+def test_anchors_are_apart_and_hold_both_ends() -> None:
+    stamp = np.cumsum(np.random.default_rng(0).uniform(0.01, 0.2, 80))
+    anchors = np.array(anchor_frames(stamp))
+    assert anchors[0] == 0 and anchors[-1] == 79 and (np.diff(anchors) > 0).all()
+    assert (np.diff(stamp[anchors])[:-1] >= 0.35 - 1e-6).all() and np.diff(stamp[anchors]).max() < 0.35 + 0.2
+    assert anchor_frames(stamp[:1]) == [0]
