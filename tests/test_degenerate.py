@@ -43,8 +43,8 @@ def test_nothing_but_blank_frames_is_refused_in_one_line(short: Path, slamcli: S
     faults.repaint(short, "depth", blank(0))
     result, _ = run(slamcli, short)
     assert result.exit_code == 1
-    error = [line for line in result.stderr.splitlines() if not line.startswith("Warning")]
-    assert len(error) == 1
+    start, *error = [line for line in result.stderr.splitlines() if not line.startswith("Warning")]
+    assert start.startswith("short -> ") and len(error) == 1
     assert "no feature" in error[0]
     assert "slamcli inspect" in error[0]
 
@@ -72,7 +72,8 @@ def test_blank_frames_on_the_way_are_lost_and_the_rest_is_mapped(short: Path, sl
 def test_no_depth_anywhere_gives_empty_maps_and_warnings(short: Path, slamcli: Slamcli) -> None:
     faults.repaint(short, "depth", blank(0))
     result, states = run(slamcli, short)
-    assert result.exit_code == 0, result.output
+    assert result.exit_code == 1
+    assert "no frame has a pose" in result.stderr.splitlines()[-1]
     assert set(states.values()) == {"up to date"}
     assert "depth" in result.stderr.lower()
     assert "Traceback" not in result.output
@@ -92,11 +93,19 @@ def test_a_recording_of_one_frame_is_mapped(short: Path, slamcli: Slamcli) -> No
     assert n_poses(short) == 1
 
 
-def test_colour_and_depth_of_different_size(short: Path, slamcli: Slamcli) -> None:
+def test_smaller_depth_of_the_same_view_is_taken(short: Path, slamcli: Slamcli) -> None:
     faults.repaint(short, "depth", lambda picture: cv2.resize(picture, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_NEAREST))
     result, _ = run(slamcli, short)
+    assert result.exit_code == 0, result.output
+    assert n_poses(short) == len(faults.entries(short, "rgb"))
+
+
+def test_depth_of_another_shape_than_colour_is_refused(short: Path, slamcli: Slamcli) -> None:
+    faults.repaint(short, "depth", lambda picture: picture[:, : picture.shape[1] // 2])
+    result, _ = run(slamcli, short)
+    assert result.exit_code == 1
     assert "Traceback" not in result.output
-    assert "size" in result.stderr or "80 x 60" in result.stderr
+    assert "80 x 120" in result.stderr
 
 
 def test_depth_of_8_bits(short: Path, slamcli: Slamcli) -> None:

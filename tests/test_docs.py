@@ -2,6 +2,7 @@
 
 import re
 import shlex
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -48,5 +49,5 @@ def test_every_setting_in_the_documents_is_known(page: Path) -> None:
 
 def test_the_camera_file_in_the_documents_is_whole_and_right() -> None:
     text = re.search(r"```toml\n(.*?)```", (ROOT / "docs" / "robot.md").read_text(encoding="utf-8"), re.S).group(1)
-    camera = Camera.from_dict(toml.tomllib.loads("\n".join(line.strip() for line in text.splitlines())), source="docs/robot.md")
+    camera = Camera.from_dict(tomllib.loads("\n".join(line.strip() for line in text.splitlines())), source="docs/robot.md")
     assert (camera.width, camera.height, camera.depth_scale) == (640, 480, 1000.0)

@@ -67,10 +67,21 @@ def run_command(
         done = api.run(target, path=named, data=data, look=_look, **options)
     if as_json:
         click.echo(json.dumps(_made_object(done.directory), indent=1))
-        return
-    if until is None:
-        _tell_made(done.directory)
-    click.echo(done.path)
+    else:
+        if until is None:
+            _tell_made(done.directory)
+        click.echo(done.path)
+    _refuse_no_pose(done.directory)
+
+
+def _refuse_no_pose(rundir: "RunDir") -> None:
+    """End with status 1 where no frame has a pose: the maps are there, and show nothing."""
+    from slamcli.errors import SlamError
+
+    counts = (rundir.record("loop") or {}).get("summary", {})
+    if counts and counts["lost"] == counts["frames"]:
+        root = rundir.info()["root"]
+        raise SlamError(f"{rundir.path}: no frame has a pose, so there is no map; the warnings say why; try: slamcli inspect {root}")
 
 
 def _tell_made(rundir: "RunDir") -> None:

@@ -340,9 +340,7 @@ class RobotConfig:
     """The robot that the grid is for, as plan and export-grid need it; its height and what it climbs are grid2d.band_high and band_low."""
 
     radius: float = option(0.2, "radius of the circle that the robot fits into [m]", ge=0, le=100)
-    mount: str = option(
-        "", "where the camera's body is on the robot's base: x,y,z,roll,pitch,yaw [m, rad] as a URDF origin; empty = not told"
-    )
+    mount: str = option("", "the camera on the robot's base as a URDF origin: x,y,z,roll,pitch,yaw [m, rad]")
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from slamcli.errors import SlamError
 from slamcli.geometry import se3
 from slamcli.navigation.robot_pose import planar_pose
 from slamcli.runs.run_directory import RunDir
@@ -32,6 +33,8 @@ def read(run: RunDir) -> Placement:
     """Read a run's placement; SlamError where densify has not been run, or no frame has a pose."""
     ground = run.load(Ground, "densify")
     T_lc = ground.T_lw @ camera_poses(run)
+    if len(T_lc) == 0:
+        raise SlamError(f"{run.path}: no frame has a pose")
     return Placement(ground.T_lw, bool(ground.is_found), planar_pose(T_lc[0]), planar_pose(T_lc[-1]))
 
 

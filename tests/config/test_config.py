@@ -1,6 +1,7 @@
 """The configuration: one source for defaults, bounds and help; every mistake is named with the key and what would do."""
 
 import dataclasses
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -52,7 +53,7 @@ def test_dump_and_read_are_inverse(tmp_path: Path) -> None:
 @given(st.text(max_size=40))
 def test_any_text_survives_being_written(text: str) -> None:
     if "\x00" not in text and text.isprintable():
-        assert toml.tomllib.loads(f"x = {toml._toml(text)}") == {"x": text}
+        assert tomllib.loads(f"x = {toml._toml(text)}") == {"x": text}
 
 
 @given(st.text(max_size=30))
@@ -84,7 +85,7 @@ def test_any_assignment_is_taken_or_refused_in_one_line(text: str) -> None:
         ("loop.enabled=1", "must be true or false"),
         ("match.method=magic", "must be one of words, brute"),
         ("seed=-1", "must be >= 0"),
-        ("seed=99999999999999999999", "must be <= 9223372036854775807"),
+        ("seed=99999999999999999999", "seed=99999999999999999999: too large a number"),
         ("seed", "write -s section.key=value"),
         ("=1", "write -s section.key=value"),
         ("track=1", "track is a section"),
@@ -184,7 +185,7 @@ def test_what_is_changed_is_told_with_its_default() -> None:
     assert "seed = 3  # default: 0\n" in text
     assert "min_inliers = 20  # default: 15\n" in text
     assert "fx = 500.0" in text
-    assert toml.merge(Config(), toml.tomllib.loads(text), source="text") == config
+    assert toml.merge(Config(), tomllib.loads(text), source="text") == config
 
 
 def test_options_are_found_by_a_word_of_their_name_or_help() -> None:

@@ -1,5 +1,7 @@
 """One reach of the camera moves the ranges of all stages, and only those that nobody set."""
 
+import tomllib
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -45,4 +47,4 @@ def test_what_is_set_on_purpose_stays() -> None:
 
 def test_a_written_configuration_is_read_back_as_it_is() -> None:
     config = toml.apply(Config(), ["sensor.depth_max=2.8", "octree.max_range=3.2"])
-    assert toml.merge(Config(), toml.tomllib.loads(toml.dump(config)), source="file") == config
+    assert toml.merge(Config(), tomllib.loads(toml.dump(config)), source="file") == config
