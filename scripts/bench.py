@@ -4,14 +4,14 @@
     python scripts/bench.py                                    what each stage of the last run cost, from its records
     python scripts/bench.py -r runs/tum/fr1_xyz
     python scripts/bench.py RECORDING... [--png] [--rounds 3] [--orbslam3 ORB/bin/python words.txt] [--open3d]
-                            [--json figures.json] [--readme README.md] [--flame graph.svg]
+                            [--json figures.json] [--docs] [--flame graph.svg]
 
 With recordings, every stage runs anew in a process of its own, the others track the same images after it, and tables follow, in
 Markdown: time, in all and by stage (Table 3 of Zhao et al. 2020), APE (their Table 4) and map sizes (their Table 5). What others published is marked so.
 CPU time is of all threads, files included, per colour frame; compiling kernels, which happens once per machine, is no part of it.
 Machines differ: "of plain ORB" tells it as a multiple of what cv2.ORB_create(1000).detectAndCompute needs for the same images in the same
 session. --compare FILE warns where that multiple has grown by more than a tenth since FILE, the --json of an earlier session, was written;
---readme puts the tables between the marks in that file. Each recording's ledger follows, see ledger.py: medians over --rounds; with --png
+--docs puts one table into README.md and all into docs/figures.md, between the marks there. Each recording's ledger follows, see ledger.py: medians over --rounds; with --png
 also of the recording with its colour rewritten as PNG, which costs more to decode than JPEG does. --flame draws a flame graph.
 ORB-SLAM3 needs an environment of its own, see orbslam3.py.
 """
@@ -41,7 +41,8 @@ from slamcli.stages import NAMES
 HEADINGS = ["stage", "wall [s]", "CPU [s]", "compiling [s]", "CPU [ms/frame]", "frames/s", "peak [MiB]", "output [MB]"]
 GROWTH = 1.1  # of the CPU time since the baseline that is warned of
 YARDSTICK_FRAMES = 100
-MARKS = "<!-- figures: scripts/bench.py --readme -->", "<!-- end of figures -->"
+MARKS = "<!-- figures: scripts/bench.py --docs -->", "<!-- end of figures -->"
+ROOT = Path(__file__).resolve().parents[1]
 OURS = "slamcli"
 
 
@@ -183,6 +184,17 @@ def name_of(figures: dict[str, Any]) -> str:
     return f"{figures['recording']} (simulated)" if figures["is_simulated"] else figures["recording"]
 
 
+def summary_table(found: list[dict[str, Any]]) -> str:
+    """Accuracy and cost beside the best-known rival, in one table."""
+    rival = "ORB-SLAM3"
+    rows = [["", "frames", "APE [m]", f"{rival}'s", "CPU [ms/frame], maps included", f"{rival}'s, without maps"]]
+    for figures in found:
+        ours, theirs = (figures["systems"].get(system) for system in (OURS, rival))
+        cpu = [f"{f['cpu_ms']:.0f}" if f else "" for f in (ours, theirs)]
+        rows.append([name_of(figures), str(figures["frames"]), ape_cell(ours), ape_cell(theirs), *cpu])
+    return markdown(rows)
+
+
 def time_table(found: list[dict[str, Any]]) -> str:
     """What each system costs."""
     rows = [["measured here", "system", "frames", "CPU [ms/frame]", "of plain ORB", "peak memory [MiB]"]]
@@ -277,7 +289,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=1, help="how often; times are medians [1]")
     parser.add_argument("--flame", type=Path, metavar="FILE", help="draw a flame graph of the first recording, SVG; needs py-spy")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures")
-    parser.add_argument("--readme", type=Path, metavar="FILE", help="put the tables into this file")
+    parser.add_argument("--docs", action="store_true", help="put the tables into README.md and docs/figures.md")
     parser.add_argument("--compare", type=Path, metavar="FILE", help="figures of an earlier session")
     given = parser.parse_args()
     try:
@@ -293,8 +305,9 @@ def main() -> None:
         if given.json:
             given.json.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
         print(f"{tables(found)}\n\n{ledgers(found)}")
-        if given.readme:
-            put_into(given.readme, tables(found))
+        if given.docs:
+            put_into(ROOT / "README.md", summary_table(found))
+            put_into(ROOT / "docs" / "figures.md", tables(found))
         if given.compare:
             for line in slower(found, json.loads(given.compare.read_text(encoding="utf-8"))):
                 print(f"warning: {line}", file=sys.stderr)
