@@ -74,7 +74,15 @@ def _read(path: Path) -> np.ndarray:
             return np.asarray(np.lib.format.open_memmap(path, mode="c"))
     except FileNotFoundError:
         raise ValueError(f"{path.name} is not there") from None
-    except (ValueError, EOFError, FloatingPointError, SyntaxError, TokenError) as error:  # a map larger than its file is refused unread
+    except (
+        ValueError,
+        EOFError,
+        FloatingPointError,
+        OverflowError,
+        SyntaxError,
+        TokenError,
+        TypeError,
+    ) as error:  # a map larger than its file is refused unread
         raise ValueError(f"{path.name}: {error}") from error
     except OSError as error:
         raise SlamError(f"{path}: cannot be read ({files.told(error)})") from error

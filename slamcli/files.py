@@ -230,7 +230,8 @@ def user_path(text: str | Path) -> Path:
     """Expand `~`; SlamError for a home that is not there and for a name that no file can have."""
     try:
         path = Path(text).expanduser()
-        path.is_file()  # whatever the answer: a NUL byte or a name too long to ask about is found here
+        with contextlib.suppress(FileNotFoundError, NotADirectoryError, PermissionError):
+            os.stat(path)  # finds a NUL byte, a name too long, links that go round
     except (RuntimeError, ValueError, OSError) as error:
         raise SlamError(f"{str(text)[:LONGEST_NAME]!r}: not the name of a file ({error})") from error
     return path

@@ -2,6 +2,8 @@
 
 import errno
 import importlib
+import math
+from collections.abc import Callable
 from typing import Any
 
 import click
@@ -93,6 +95,25 @@ def _commands_of(module: Any) -> list[click.Command]:
     return [command for command in found if id(command) not in members]
 
 
+def _finite(command: click.Command) -> click.Command:
+    """Let a command take no number that is none: a bound of click lets nan pass, as no comparison with it holds."""
+    for member in command.commands.values() if isinstance(command, click.Group) else ():
+        _finite(member)
+    for parameter in command.params:
+        parameter.callback = _checking(parameter.callback)
+    return command
+
+
+def _checking(callback: Callable[..., Any] | None) -> Callable[..., Any]:
+    def check(context: click.Context, parameter: click.Parameter, value: Any) -> Any:
+        for number in value if isinstance(value, tuple) else (value,):
+            if isinstance(number, float) and not math.isfinite(number):
+                raise click.BadParameter(f"{number} is not a finite number", context, parameter)
+        return callback(context, parameter, value) if callback else value
+
+    return check
+
+
 for topic in TOPICS:
     for command in _commands_of(importlib.import_module(f"slamcli.cli.{topic}")):
-        cli.add_command(verbose_option(command))
+        cli.add_command(_finite(verbose_option(command)))

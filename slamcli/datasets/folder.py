@@ -9,6 +9,7 @@ from slamcli.errors import SlamError
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".ppm", ".pgm", ".webp")
 DEPTH_SUFFIXES = (*IMAGE_SUFFIXES, ".exr", ".npy", ".pfm")
 COLOUR_FOLDERS = ("rgb", "color", "colour", "image", "images", "colors", "rgbs", "cam0", "left")
+MOST_DIGITS = 18  # of a number in a name: what 64 bits hold
 DEPTH_FOLDERS = ("depth", "depths", "depth_registered", "aligned_depth", "depth_aligned", "depth_images")
 
 
@@ -74,7 +75,11 @@ class Folder:
 
     def _as_spelt(self, folder: str) -> str:
         """Give the folder's name as the file system spells it; unchanged where it is there, or not there in any spelling."""
-        if not folder or (self.root / folder).is_dir():
+        try:
+            is_there = not folder or (self.root / folder).is_dir()
+        except (OSError, ValueError):  # a name that no folder can have
+            is_there = True
+        if is_there:
             return folder
         return subfolder(self.root, (folder.lower(),)) or folder
 
@@ -98,7 +103,7 @@ def subfolder(root: Path, names: tuple[str, ...]) -> str | None:
 def number_of(name: str) -> int | None:
     """Give the last number in a file's name without its suffix, such as 12 of "frame-000012.color.jpg"; None where it has none."""
     found = re.findall(r"\d+", PurePosixPath(name).name.split(".")[0]) or re.findall(r"\d+", PurePosixPath(name).stem)
-    return int(found[-1]) if found else None
+    return int(found[-1][-MOST_DIGITS:]) if found else None
 
 
 def numbered(folder: Folder, below: str, suffixes: tuple[str, ...], *, ending: str = "") -> dict[int, str]:

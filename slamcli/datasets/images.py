@@ -6,14 +6,16 @@ integer arithmetic, hence the same on every machine: a JPEG stores it, a PNG's i
 """
 
 import struct
+import tokenize
 from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
 
+from slamcli import files
 from slamcli.datasets import png
-from slamcli.errors import BadFrame
+from slamcli.errors import BadFrame, SlamError
 
 MAX_BYTES = 256 << 20  # of one image file
 MAX_PIXELS = 100_000_000  # of one image
@@ -69,12 +71,11 @@ Picture = bytes | Pixels
 def read_bytes(path: Path) -> bytes:
     """Read a whole image file; BadFrame where it is missing, empty, cut off or absurdly large."""
     try:
-        size = path.stat().st_size
-        if size > MAX_BYTES:
-            raise BadFrame(f"{path}: {size >> 20} MB is too large for an image")
-        data = path.read_bytes()
+        data = files.read_bytes(path, limit=MAX_BYTES)
     except OSError as error:
         raise BadFrame(f"{path}: cannot be read ({error.strerror})") from error
+    except SlamError as error:
+        raise BadFrame(str(error)) from error
     check_whole(data, str(path))
     return data
 
@@ -201,7 +202,7 @@ def decode_npy(data: bytes, name: str) -> np.ndarray:
         if dtype.hasobject or dtype.kind not in "uif" or int(np.prod(shape, dtype=np.float64)) * dtype.itemsize > len(data):
             raise BadFrame(f"{name}: is no array of numbers, or is cut off")
         return np.load(io.BytesIO(data), allow_pickle=False)
-    except (ValueError, EOFError) as error:
+    except (ValueError, EOFError, OverflowError, SyntaxError, TypeError, tokenize.TokenError) as error:  # all that numpy's header may raise
         raise BadFrame(f"{name}: is damaged ({error})") from error
 
 

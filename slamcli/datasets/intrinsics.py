@@ -2,13 +2,13 @@
 
 import json
 import re
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from slamcli import files
 from slamcli.errors import SlamError
 from slamcli.geometry.camera import EQUIDISTANT
 
@@ -36,7 +36,7 @@ def read_camera_file(path: Path) -> tuple[dict[str, Any], dict[str, Any] | None,
     """Read our own camera file: (keys of the camera, those of its table [depth] or None, the depth camera's pose T_cd (4, 4) or None)."""
     text = _read(path, "a camera file")
     try:
-        values = tomllib.loads(text) if path.suffix == ".toml" else json.loads(text)
+        values = files.parse_toml(text.encode(), source=str(path)) if path.suffix == ".toml" else json.loads(text)
     except (ValueError, RecursionError) as error:  # both parsers' errors and wrong encoding are ValueErrors
         raise SlamError(f"{path}: cannot be parsed ({error})") from error
     depth = values.pop("depth", None) if isinstance(values, dict) else None
@@ -142,7 +142,7 @@ def _scalars(flat: Mapping[str, Any]) -> dict[str, Any]:
 def _flat(value: Any) -> list[float]:
     try:
         return [float(x) for x in np.asarray(value, dtype=np.float64).ravel()]
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         return []
 
 
@@ -206,9 +206,7 @@ def _pose(depth: Mapping[str, Any], path: Path) -> np.ndarray | None:
 
 def _read(path: Path, what: str) -> str:
     try:
-        if path.stat().st_size > MAX_BYTES:
-            raise SlamError(f"{path}: too large for {what}")
-        return path.read_text(encoding="utf-8-sig")
+        return files.read_bytes(path, limit=MAX_BYTES).decode("utf-8-sig")
     except OSError as error:
         raise SlamError(f"{path}: cannot be read ({error.strerror})") from error
     except UnicodeDecodeError as error:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from slamcli import files
 from slamcli.datasets.folder import COLOUR_FOLDERS, DEPTH_FOLDERS, Folder
 from slamcli.errors import SlamError
 
@@ -112,9 +113,7 @@ def data_lines(path: Path) -> list[tuple[int, str]]:
 def read_text(path: Path) -> str:
     """Read a text file in UTF-8 or UTF-16, with a mark of byte order or without."""
     try:
-        if path.stat().st_size > MAX_LIST_BYTES:
-            raise SlamError(f"{path}: {path.stat().st_size >> 20} MB is too large for a list of images")
-        data = path.read_bytes()
+        data = files.read_bytes(path, limit=MAX_LIST_BYTES)
     except OSError as error:
         raise SlamError(f"{path}: cannot be read ({error.strerror})") from error
     if data.startswith((b"\xff\xfe", b"\xfe\xff")):

@@ -42,7 +42,7 @@ class ImageFiles:
         """Ask the file system."""
         try:
             return (self.root / self.names[i]).stat().st_size
-        except OSError:
+        except (OSError, ValueError):  # ValueError: a NUL byte in the name
             return -1
 
     def read(self, i: int) -> bytes:

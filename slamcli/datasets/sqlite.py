@@ -20,7 +20,7 @@ def query(path: Path, text: str, *, what: str) -> list[tuple[Any, ...]]:
     try:
         with _connect(path) as connection:
             return connection.execute(text).fetchall()
-    except sqlite3.Error as error:
+    except (sqlite3.Error, UnicodeDecodeError) as error:
         raise SlamError(f"{path}: is not {what}, or is damaged ({error})") from error
 
 

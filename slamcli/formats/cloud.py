@@ -151,7 +151,9 @@ def read_pcd(path: Path) -> Points:
         kinds = [PCD_KINDS.get(kind, {}).get(size, "") for kind, size in zip(header.get("TYPE", []), header.get("SIZE", []), strict=False)]
         counts = header.get("COUNT", ["1"] * len(names))
         if not names or len(kinds) != len(names) or not all(kinds) or counts != ["1"] * len(names):
-            raise SlamError(f"{path}: the PCD header's FIELDS, SIZE, TYPE and COUNT do not describe single numbers")
+            raise SlamError(
+                f"{path}: the PCD header's FIELDS, SIZE, TYPE and COUNT do not describe single numbers, or of a type that is not known"
+            )
         n = _count(path, " ".join(header.get("POINTS", [])), "points")
         layout = " ".join(header["DATA"])
         dtype = _record_type(path, list(zip(names, kinds, strict=True)), "<")

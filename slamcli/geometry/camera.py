@@ -12,6 +12,9 @@ from slamcli.errors import SlamError
 
 DEPTH_VALUES = 1 << 16  # of a 16-bit depth image
 NO_READING = (0, DEPTH_VALUES - 1)  # 16-bit readings that mean none: 0 everywhere, the largest value of cameras that saturate
+DISTORTION = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+MAX_DISTORTION = 1e4  # of a coefficient; rational models of real lenses reach some hundreds
+LARGEST = 1e9  # of any of the numbers below: beyond, it is no camera and its squares are no numbers
 MAX_INVERSE_DEPTH_OFFSET = 0.1  # [1/m]; a Kinect's is some thousandths
 POLYNOMIAL, EQUIDISTANT = "polynomial", "equidistant"  # values of Camera.lens
 LATER_FIELDS = {"k4": 0.0, "k5": 0.0, "k6": 0.0, "lens": POLYNOMIAL}  # written only where they say something
@@ -45,8 +48,9 @@ class Camera:
             raise SlamError(f"camera.lens = {self.lens!r}: must be {POLYNOMIAL} or {EQUIDISTANT}")
         for name in (f.name for f in fields(self) if f.name != "lens"):
             value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(value):
-                raise SlamError(f"camera.{name} = {value!r}: must be a finite number")
+            if isinstance(value, bool) or not isinstance(value, (int, float)) or not -LARGEST <= value <= LARGEST:
+                shown = repr(value)[:40] if not isinstance(value, int) or isinstance(value, bool) else "a number of too many digits"
+                raise SlamError(f"camera.{name} = {shown}: must be a finite number")
         for name in ("width", "height"):
             size = getattr(self, name)
             if size != int(size) or not 1 <= size <= 16384:
@@ -55,6 +59,9 @@ class Camera:
             focal = getattr(self, name)
             if not 0.1 * self.width <= focal <= 20 * self.width:
                 raise SlamError(f"camera.{name} = {focal:g}: not a focal length in pixels of an image {self.width} wide")
+        for name in DISTORTION:
+            if not abs(getattr(self, name)) <= MAX_DISTORTION:
+                raise SlamError(f"camera.{name} = {getattr(self, name):g}: no lens bends like that; is it a number of another kind?")
         for name, size in (("cx", self.width), ("cy", self.height)):
             if not 0.0 <= getattr(self, name) <= size:
                 raise SlamError(f"camera.{name} = {getattr(self, name):g}: the principal point is outside the image (0 to {size})")

@@ -3,6 +3,7 @@
 import importlib
 import json
 import zipfile
+import zlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -83,7 +84,7 @@ class Members:
                 return member.read(MAX_MEMBER)
         except KeyError:
             raise BadFrame(f"{where}: is not in the archive") from None
-        except (zipfile.BadZipFile, OSError, EOFError, NotImplementedError, RuntimeError, ValueError) as error:
+        except (zipfile.BadZipFile, OSError, EOFError, NotImplementedError, RuntimeError, ValueError, zlib.error) as error:
             raise BadFrame(f"{where}: is damaged ({error})") from error
 
 
