@@ -30,8 +30,9 @@ FIRST_LAGS = (-0.08, -0.06, -0.04, -0.02, 0.0, 0.02, 0.04, 0.06, 0.08)  # [s]
 THINNING = 5  # one point in five decides where the search starts
 LEAST_POINTS = 1500
 LEAST_CONTRAST = 1.12  # of the best shift over the mean of all: below, the edges do not agree on any shift
-SURE_CONTRAST = 1.4  # registered recordings reach 1.5 to 1.7: below, another size of depth is tried
+SURE_CONTRAST = 1.4  # registered recordings reach 1.5 and more; below, or where a large shift fits best, another size of depth is tried
 MAGNIFICATIONS = np.geomspace(0.6, 1.7, 53)  # of depth about the principal point: focal length of colour over that of the depth camera
+SMALL_SHIFT = 3  # px
 BETTER = 1.2  # times the contrast at 1 that another magnification needs,
 STEEPER = 1.05  # times the steepness under the edges at 1, likewise: fewer edges near the centre have more contrast by themselves,
 NOT_ONE = 0.04  # and how far from 1 it must be
@@ -89,7 +90,9 @@ def measure(dataset: Dataset, *, workers: int, blocks: int = BLOCKS) -> Registra
         shift=(float(shift[0]), float(shift[1])) if is_shift_sure else None,
         lag=round(lag, 4) if is_shift_sure and is_lag_sure else None,
         n_points=n_points,
-        magnification=_magnification(dataset, colours, edges) if shift_contrast < SURE_CONTRAST else None,
+        magnification=_magnification(dataset, colours, edges)
+        if shift_contrast < SURE_CONTRAST or max(map(abs, shift)) > SMALL_SHIFT
+        else None,
         shift_contrast=shift_contrast,
         lag_contrast=lag_contrast,
     )

@@ -167,7 +167,7 @@ def test_one_frame_and_damaged_images(spoilt: Path) -> None:
     assert "files" in alarms(found) or found.level == ERROR
 
 
-@pytest.mark.parametrize(("focal", "aside"), [(0.75, 0.015), (1.35, 0.025)])
+@pytest.mark.parametrize(("focal", "aside"), [(0.87, 0.015), (1.35, 0.025)])
 def test_depth_of_another_camera_is_told_with_its_focal_length(spoilt: Path, focal: float, aside: float) -> None:
     camera = open_dataset(str(spoilt)).camera
     other, T_cd = replace(camera, fx=focal * camera.fx, fy=focal * camera.fy), np.eye(4)
