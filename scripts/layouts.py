@@ -2,6 +2,7 @@
 
     python scripts/layouts.py path/to/rgbd_dataset_freiburg1_xyz --frames 200 --until loop
     python scripts/layouts.py path/to/rgbd_dataset_freiburg1_xyz --layouts mcap ros1_compressed --cost
+    python scripts/layouts.py path/to/rgbd_dataset_freiburg1_xyz --frames 1000 --phone
 
 Depth keeps its readings and colour its bytes; pixels of bags without compression are those of a PNG. Stamps that a layout has must come
 back bit for bit, and with them every array of features and every pose; where it has none, features are compared.
@@ -25,6 +26,8 @@ import slamcli
 from slamcli.config.options import RecordingConfig
 from slamcli.console import table
 from slamcli.datasets import open_dataset
+from slamcli.evaluation import trajectory_error
+from slamcli.formats.trajectory import read_tum
 from slamcli.schema import Features
 
 RAW_COLOUR = ("ros1_raw", "ros1_lz4", "ros2_zstd", "mcap")
@@ -38,9 +41,10 @@ def main() -> None:
     parser.add_argument("--until", default="extract", help="the stage up to which each is run")
     parser.add_argument("--layouts", nargs="*", default=[layout.name for layout in LAYOUTS])
     parser.add_argument("--cost", action="store_true", help="CPU time of opening and of reading all frames instead of a run")
+    parser.add_argument("--phone", action="store_true", help="compare APE with that of the same frames as a phone records them, lossy")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        rows = compare(arguments, Path(folder))
+        rows = as_phone(arguments, Path(folder)) if arguments.phone else compare(arguments, Path(folder))
     print(table(rows))
 
 
@@ -69,6 +73,25 @@ def compare(arguments: argparse.Namespace, folder: Path) -> list[list[str]]:
                 rows.append([layout.name, f"{found[0]:.2f}", f"{found[1]:.0f}", f"{1000 * found[2]:.1f}", f"{found[2] / own[2]:.2f}"])
             else:
                 rows.append([layout.name, *verdict(run(path, camera, folder / f"run-{layout.name}", arguments.until), own, layout)])
+    return rows
+
+
+def as_phone(arguments: argparse.Namespace, folder: Path) -> list[list[str]]:
+    """Run the same frames as stored and as a phone records them."""
+    from datasets.test_same_recording import content_of
+
+    dataset = open_dataset(arguments.recording)
+    frames = tuple(i for i in range(len(dataset)) if np.isfinite(dataset.depth_stamp[i]))[: arguments.frames]
+    content = content_of(dataset, frames, suffix=".jpg")
+    rows = [["as", "APE [m]", "frames with a pose"]]
+    for name, write in (("stored", layouts.tum), ("phone", layouts.phone)):
+        path = write(content, folder / name)
+        (path / "groundtruth.txt").symlink_to(dataset.root.resolve() / "groundtruth.txt")
+        ape = trajectory_error.ape(
+            slamcli.run(str(path), path=folder / f"run-{name}", until="loop").trajectory("loop"),
+            read_tum(path / "groundtruth.txt"), n_frames=len(frames), name=name, stage="loop",
+        )  # fmt: skip
+        rows.append([name, f"{np.sqrt(np.mean(ape.error**2)):.4f}", f"{ape.n_poses} of {len(frames)}"])
     return rows
 
 

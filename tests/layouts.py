@@ -224,6 +224,27 @@ def transforms(content: Content, out: Path) -> Path:
     return out
 
 
+def phone(content: Content, out: Path) -> Path:
+    """StrayScanner's layout, which loses: colour as H.264, depth of 256 x 192 in millimetres, one stamp for both."""
+    import av
+
+    (out / "depth").mkdir(parents=True)
+    with av.open(str(out / "rgb.mp4"), "w") as container:
+        stream = container.add_stream("h264", rate=30)
+        (stream.width, stream.height), stream.pix_fmt, stream.options = content.size, "yuv420p", {"crf": "18", "preset": "veryfast"}
+        for i in range(len(content.stamp)):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(content.bgr(i), format="bgr24")))
+        container.mux(stream.encode())
+    rows = ["timestamp, frame, x, y, z, qx, qy, qz, qw"]
+    for i, stamp in enumerate(content.stamp):
+        small = cv2.resize(content.raw[i], (256, 192), interpolation=cv2.INTER_NEAREST)
+        (out / "depth" / f"{i:06d}.png").write_bytes(png16(np.rint(small * (1000.0 / content.scale)).astype(np.uint16)))
+        rows.append(f"{seconds(stamp)}, {i:06d}, 0, 0, 0, 0, 0, 0, 1")
+    (out / "odometry.csv").write_text("\n".join(rows))
+    (out / "camera.toml").write_text(camera_toml(content).replace(f"depth_scale = {content.scale!r}", "depth_scale = 1000.0"))
+    return out
+
+
 # --- single files
 
 

@@ -40,11 +40,19 @@ class Calibration:
 
 
 def find_calibration(root: Path, files: tuple[str, ...] = ()) -> Calibration:
-    """Look for intrinsics in a recording's folder: a camera file of ours, the number in a TUM name, then `files` and the common ones."""
+    """Look for intrinsics in a recording's folder: a camera file of ours, the number in a TUM name, then `files` and the common ones.
+
+    A camera file that has not all of fx, fy, cx and cy adds to what else is found.
+    """
     for name in CAMERA_FILES:
         if (root / name).is_file():
             values, depth, T_cd = read_camera_file(root / name)
-            return Calibration(values, str(root / name), depth, T_cd)
+            others = {} if all(key in values for key in NEEDED) else _found(root, files).values
+            return Calibration({**others, **values}, str(root / name), depth, T_cd)
+    return _found(root, files)
+
+
+def _found(root: Path, files: tuple[str, ...]) -> Calibration:
     number = freiburg_number(root.resolve().name)
     if number:
         return Calibration(FREIBURG[number].to_dict(), f"calibration of freiburg{number}")

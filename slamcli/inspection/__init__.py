@@ -27,6 +27,7 @@ from slamcli.inspection.findings import (
     about_order,
     about_registration,
     about_unit,
+    is_textured,
 )
 from slamcli.inspection.pictures import Pictures
 from slamcli.inspection.registration import Registration
@@ -93,7 +94,7 @@ def inspect(
         *about_colour(seen),
         *about_depth(dataset, times, seen),
         *about_unit(dataset, unit),
-        *about_registration(dataset, fit, times),
+        *about_registration(dataset, fit, times, is_textured=is_textured(seen)),
     ]
     return Inspection(str(dataset.root), findings, _facts(dataset, times, seen, unit, fit))
 
@@ -107,7 +108,7 @@ def quick_look(dataset: Dataset, *, workers: int = 2) -> list[Finding]:
         *about_files(dataset, seen),
         *about_colour(seen),
         *about_depth(dataset, timing.judge(dataset), seen),
-        *about_registration(dataset, fit, timing.judge(dataset)),
+        *about_registration(dataset, fit, timing.judge(dataset), is_textured=is_textured(seen)),
     ]
     return [finding for finding in findings if finding.level != NOTE and finding.check != "time offset"]
 
@@ -134,6 +135,7 @@ def _facts(dataset: Dataset, times: Timing, seen: Pictures, unit: DepthUnit, fit
         "holes": _median(seen.holes),
         "never_seen": round(seen.never_seen, 4),
         "depth_shift_px": list(fit.shift) if fit.shift is not None else None,
+        "depth_magnification": _finite(fit.magnification, 3),
         "depth_lag_s": _finite(fit.lag, 4),
         "blur": _median(seen.blur),
         "saturated": _median(seen.saturated),

@@ -25,6 +25,9 @@ NEVER_SEEN = 0.35  # share of the pixels without depth in all frames; sound ones
 EMPTY = 0.98  # share of holes from which a depth image counts as empty
 UNMATCHED = 0.15  # share of colour frames without depth; sound ones have 0.01 to 0.04
 SHIFT = 4.0 / 640  # of the picture's width; sound ones are within 1 px of 640
+MANY_EDGES = 8000  # depth edges that must meet some of colour's, in a picture with texture
+TEXTURED = 100.0  # FAST corners per 640 x 480 px of such a picture
+DESCRIBE = "describe the depth camera in a table [depth] of camera.toml: fx fy cx cy and its place"
 EXPECTED_LAG = (-0.02, 0.035)  # [s]; the stamps of the first Kinect's depth are about 0.02 s late
 
 
@@ -157,6 +160,12 @@ def about_depth(dataset: Dataset, times: Timing, seen: Pictures) -> list[Finding
     return findings
 
 
+def is_textured(seen: Pictures) -> bool:
+    """Say whether a typical picture has enough corners for its edges to be told."""
+    known = seen.corners[np.isfinite(seen.corners)]
+    return bool(len(known) and np.median(known) >= TEXTURED)
+
+
 def about_unit(dataset: Dataset, unit: DepthUnit) -> list[Finding]:
     """Judge the depth scale."""
     if unit.likely_scale is None:
@@ -165,10 +174,18 @@ def about_unit(dataset: Dataset, unit: DepthUnit) -> list[Finding]:
     return [Finding(ERROR, "depth scale", message, f"try: -s camera.depth_scale={unit.likely_scale:g}")]
 
 
-def about_registration(dataset: Dataset, fit: Registration, times: Timing) -> list[Finding]:
+def about_registration(dataset: Dataset, fit: Registration, times: Timing, *, is_textured: bool) -> list[Finding]:
     """Judge whether depth lies on colour, in place and in time."""
     findings = []
-    if fit.shift is not None and max(map(abs, fit.shift)) > max(SHIFT * dataset.camera.width, 2.0):
+    camera = dataset.camera
+    if fit.magnification is not None:
+        message = f"depth does not lie on colour: its edges fit when it is enlarged {fit.magnification:.2f} times"
+        advice = f"it seems to be in the pixels of a depth camera of focal length {camera.fx / fit.magnification:.0f} px: {DESCRIBE}"
+        findings.append(Finding(WARNING, "registration", message, advice))
+    elif fit.shift is None and fit.n_points >= MANY_EDGES and is_textured:
+        message = "the edges of depth meet those of colour nowhere: depth may not be registered, and the map's scale is then in doubt"
+        findings.append(Finding(WARNING, "registration", message, f"record depth registered to colour, or {DESCRIBE}"))
+    elif fit.shift is not None and max(map(abs, fit.shift)) > max(SHIFT * dataset.camera.width, 2.0):
         message = f"depth does not lie on colour: its edges fit when moved by ({fit.shift[0]:+.0f}, {fit.shift[1]:+.0f}) px"
         findings.append(Finding(WARNING, "registration", message, "register depth to the colour camera, with that camera's calibration"))
     if fit.lag is not None and not EXPECTED_LAG[0] <= fit.lag <= EXPECTED_LAG[1]:

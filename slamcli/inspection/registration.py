@@ -30,6 +30,12 @@ FIRST_LAGS = (-0.08, -0.06, -0.04, -0.02, 0.0, 0.02, 0.04, 0.06, 0.08)  # [s]
 THINNING = 5  # one point in five decides where the search starts
 LEAST_POINTS = 1500
 LEAST_CONTRAST = 1.12  # of the best shift over the mean of all: below, the edges do not agree on any shift
+SURE_CONTRAST = 1.4  # registered recordings reach 1.5 and more; below, or where a large shift fits best, another size of depth is tried
+MAGNIFICATIONS = np.geomspace(0.6, 1.7, 53)  # of depth about the principal point: focal length of colour over that of the depth camera
+SMALL_SHIFT = 3  # px
+BETTER = 1.2  # times the contrast at 1 that another magnification needs,
+STEEPER = 1.05  # times the steepness under the edges at 1, likewise: fewer edges near the centre have more contrast by themselves,
+NOT_ONE = 0.04  # and how far from 1 it must be
 LEAST_LAG_CONTRAST = 1.08  # of the best lag over lags 0.05 s away: below, there was too little motion to tell
 LARGEST_FLOW_SIDE = 320  # px; optical flow is computed on pictures reduced to this width
 
@@ -41,6 +47,9 @@ class Registration:
     shift: tuple[float, float] | None  # (dx, dy) [px] by which depth must be moved to fit colour; None = cannot be told
     lag: float | None  # [s] by which depth stamps are late; None = cannot be told
     n_points: int
+    magnification: (
+        float | None
+    )  # by which depth must be enlarged about the principal point to fit colour, where 1 does not; None = 1 fits best
     shift_contrast: float
     lag_contrast: float
 
@@ -69,7 +78,7 @@ def measure(dataset: Dataset, *, workers: int, blocks: int = BLOCKS) -> Registra
     colours, edges = _collect(dataset, workers, blocks)
     n_points = sum(len(e.xy) for e in edges)
     if n_points < LEAST_POINTS or len(colours.stamp) < 3:
-        return Registration(None, None, n_points, 1.0, 1.0)
+        return Registration(None, None, n_points, None, 1.0, 1.0)
     lag = _first_guess(colours, edges)
     shift, _ = _best_shift(colours, edges, lag)
     lag, _ = _best_lag(colours, edges, shift)
@@ -81,6 +90,9 @@ def measure(dataset: Dataset, *, workers: int, blocks: int = BLOCKS) -> Registra
         shift=(float(shift[0]), float(shift[1])) if is_shift_sure else None,
         lag=round(lag, 4) if is_shift_sure and is_lag_sure else None,
         n_points=n_points,
+        magnification=_magnification(dataset, colours, edges)
+        if shift_contrast < SURE_CONTRAST or max(map(abs, shift)) > SMALL_SHIFT
+        else None,
         shift_contrast=shift_contrast,
         lag_contrast=lag_contrast,
     )
@@ -207,6 +219,28 @@ def _best_shift(colours: _Colours, edges: list[_Edges], lag: float) -> tuple[tup
     fine = {(dx, dy): _score(colours, places, dx, dy) for dx in range(x - 2, x + 3) for dy in range(y - 2, y + 3)}
     best = max(fine, key=fine.__getitem__)
     return best, fine[best] / max(float(np.mean(list(coarse.values()))), 1e-9)
+
+
+def _magnification(dataset: Dataset, colours: _Colours, edges: list[_Edges]) -> float | None:
+    """Find the magnification under which depth edges lie on the picture's, where that is clear and not 1."""
+    height, width = colours.steepness.shape[2:]
+    centre = np.array([dataset.camera.cx, dataset.camera.cy], dtype=np.float32)
+    contrast, steepness = {}, {}
+    for factor in (1.0, *MAGNIFICATIONS):
+        moved = []
+        for e in edges:
+            xy = centre + np.float32(factor) * (e.xy[::2] - centre)
+            inside = ((xy > LARGEST_SHIFT) & (xy < np.array([width, height]) - 1 - LARGEST_SHIFT)).all(axis=1)
+            moved.append(_Edges(e.stamp, xy[inside], e.is_along_y[::2][inside]))
+        places = _at_lag(colours, moved, 0.0)
+        if len(places) >= LEAST_POINTS:
+            scores = [_score(colours, places, dx, dy) for dx in _steps(3) for dy in _steps(3)]
+            contrast[factor], steepness[factor] = max(scores) / max(float(np.mean(scores)), 1e-9), max(scores)
+    steeper = [factor for factor in contrast if steepness[factor] > STEEPER * steepness.get(1.0, np.inf)]
+    best = max(steeper, key=contrast.__getitem__, default=1.0)
+    is_inside = MAGNIFICATIONS[1] < best < MAGNIFICATIONS[-2]  # at the ends few edges are left
+    is_clear = contrast.get(best, 0.0) > BETTER * contrast.get(1.0, np.inf) and contrast[best] >= SURE_CONTRAST
+    return float(best) if is_inside and is_clear and abs(best - 1.0) > NOT_ONE else None
 
 
 def _refine(colours: _Colours, edges: list[_Edges], shift: tuple[int, int], lag: float) -> tuple[tuple[int, int], float]:

@@ -266,6 +266,9 @@ CASES = {
     "K of twice the size without a size": Case(recalibrate(("K.txt", "120 0 63.5\n0 120 47.5\n0 0 1\n")), holds=lambda s: s.camera.fx == 60.0),
     "calibrated upright": Case(recalibrate(camera_with(width=48, height=64, cx=23.5, cy=31.5)), holds=lambda s: (s.camera.width, s.camera.cx) == (64, 31.5)),
     "of another shape": Case(recalibrate(camera_with(width=65)), said="but the calibration is for 65 x 48", refused=True),
+    "the unit in a file of its own": Case(
+        recalibrate(("K.txt", MATRIX), ("camera.toml", "depth_scale = 5000\n")), holds=lambda s: (s.camera.fx, s.camera.depth_scale) == (60.0, 5000.0)
+    ),
     "one number missing": Case(recalibrate(("camera.json", '{"fx": 60.0, "fy": 60.0, "cx": 31.5}')), said="cy is missing", refused=True),
     "none": Case(recalibrate(), said="fx, fy, cx, cy are missing; put them into a camera.toml in the folder", refused=True),
     "none, but a name": Case(recalibrate(), holds=lambda s: s.camera.fx == pytest.approx(52.5), options=RecordingConfig(known_camera="kinect1")),

@@ -3,6 +3,7 @@
 import json
 import shutil
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -14,7 +15,8 @@ from click.testing import Result
 from slamcli.datasets import depth_unit, open_dataset, silent
 from slamcli.datasets.simulate import simulate
 from slamcli.errors import SlamError
-from slamcli.inspection import ERROR, NOTE, WARNING, Inspection, inspect, pictures, registration
+from slamcli.geometry.depth_registration import Registration
+from slamcli.inspection import ERROR, NOTE, WARNING, Inspection, inspect, pictures, quick_look, registration
 
 Command = Callable[..., Result]
 
@@ -163,3 +165,31 @@ def test_one_frame_and_damaged_images(spoilt: Path) -> None:
     except SlamError as error:
         pytest.fail(f"not reported as a finding: {error}")
     assert "files" in alarms(found) or found.level == ERROR
+
+
+@pytest.mark.parametrize(("focal", "aside"), [(0.87, 0.015), (1.35, 0.025)])
+def test_depth_of_another_camera_is_told_with_its_focal_length(spoilt: Path, focal: float, aside: float) -> None:
+    camera = open_dataset(str(spoilt)).camera
+    other, T_cd = replace(camera, fx=focal * camera.fx, fy=focal * camera.fy), np.eye(4)
+    T_cd[0, 3] = aside
+    seen = Registration(camera, other, np.linalg.inv(T_cd))
+    faults.repaint(
+        spoilt, "depth", lambda raw: np.rint(np.nan_to_num(seen.apply(camera.metres[raw])) * camera.depth_scale).astype(np.uint16)
+    )
+    found = inspect(str(spoilt))
+    assert found.facts["depth_magnification"] == pytest.approx(1 / focal, rel=0.05)
+    assert "registration" in alarms(found)
+    looked = quick_look(open_dataset(str(spoilt)))
+    assert any(finding.check == "registration" and "[depth] of camera.toml" in finding.advice for finding in looked)
+
+
+def test_a_quick_look_has_nothing_to_say_of_a_sound_recording(sound: Path) -> None:
+    assert quick_look(open_dataset(str(sound))) == []
+
+
+@pytest.mark.parametrize(
+    "fault", [faults.overexposed, faults.empty_depth, faults.blurred, faults.shifted_right], ids=lambda fault: fault.__name__
+)
+def test_a_quick_look_finds_what_would_spoil_a_run(spoilt: Path, fault: Callable[[Path], None]) -> None:
+    fault(spoilt)
+    assert {finding.check for finding in quick_look(open_dataset(str(spoilt)))} & faults.FAULTS[fault]
