@@ -1,5 +1,6 @@
 """Loop closing: places seen again are recognised, verified, and pulled together."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -194,12 +195,37 @@ def is_near(a: Candidate, b: Candidate, *, span: int) -> bool:
     return abs(a.kf_i - b.kf_i) <= span and abs(a.kf_j - b.kf_j) <= span
 
 
+class Claims:
+    """Claims of revisits so far; whether a candidate is near one of them is found among those in the cells around it alone."""
+
+    def __init__(self, candidates: Iterable[Candidate], *, span: int) -> None:
+        """Take the first claims; span : key frames that one claim covers to either side, see `is_near`."""
+        self._span = span
+        self._cells: dict[tuple[int, int], list[Candidate]] = {}
+        for c in candidates:
+            self.add(c)
+
+    def add(self, c: Candidate) -> None:
+        """Note one more claim."""
+        self._cells.setdefault(self._cell(c), []).append(c)
+
+    def cover(self, c: Candidate) -> bool:
+        """Say whether a candidate claims the same revisit as any of them."""
+        i, j = self._cell(c)
+        around = (self._cells.get((i + down, j + right), ()) for down in (-1, 0, 1) for right in (-1, 0, 1))
+        return any(is_near(c, other, span=self._span) for cell in around for other in cell)
+
+    def _cell(self, c: Candidate) -> tuple[int, int]:
+        return c.kf_i // (self._span + 1), c.kf_j // (self._span + 1)
+
+
 def spread(candidates: list[Candidate], *, span: int) -> list[Candidate]:
     """Keep the first of those that claim the same revisit."""
-    kept: list[Candidate] = []
+    kept, claims = [], Claims((), span=span)
     for c in candidates:
-        if not any(is_near(c, k, span=span) for k in kept):
+        if not claims.cover(c):
             kept.append(c)
+            claims.add(c)
     return kept
 
 

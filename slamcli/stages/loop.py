@@ -17,7 +17,7 @@ from slamcli.geometry.camera import Camera
 from slamcli.schema import LOST, Closures, Map, Moving, Timing, Tracks, Words, frame_segments
 from slamcli.slam import doubt, final_refinement, loop_closing, map_merging, map_segments, pose_doubt
 from slamcli.slam.depth_tracking import Reliefs
-from slamcli.slam.loop_closing import Candidate
+from slamcli.slam.loop_closing import Candidate, Claims
 from slamcli.slam.place_recognition import PlaceIndex
 from slamcli.sparse_map import map_adjustment
 from slamcli.sparse_map.sparse_map import MapBuilder
@@ -100,19 +100,21 @@ def close_loops(builder: MapBuilder, words: Words, camera: Camera, cfg: Config, 
     fate = join_segments(builder, places, camera, cfg, rng)
     for _ in range(cfg.loop.rounds):
         new = []
+        # One closure joins its whole neighbourhood: fusion finds the rest. And where the graph contradicted one, words would only
+        # name its like again; what the poses of now name is another idea.
+        closed = Claims((c for c in fate.values() if c.is_accepted), span=cfg.loop.closure_spacing)
+        contradicted = Claims((c for c in fate.values() if not c.is_accepted and c.T_ij is not None), span=cfg.loop.closure_spacing)
         candidates = loop_closing.find_candidates(builder, places, cfg.loop) + loop_closing.find_near(builder, places, cfg.loop)
         for candidate in tools.progress(candidates, "loop"):
             pair = (candidate.kf_i, candidate.kf_j)
             if are_apart(builder, candidate):
                 continue
-            # One closure joins its whole neighbourhood: fusion finds the rest. And where the graph contradicted one, words would only
-            # name its like again; what the poses of now name is another idea.
-            done = [c for c in fate.values() if c.is_accepted or (c.T_ij is not None and not candidate.is_near)]
-            if any(loop_closing.is_near(candidate, c, span=cfg.loop.closure_spacing) for c in done):
+            if closed.cover(candidate) or (not candidate.is_near and contradicted.cover(candidate)):
                 continue
             fate[pair] = loop_closing.verify(builder, words, candidate, camera, cfg.loop, cfg.sensor, rng)
             if fate[pair].is_accepted:
                 new.append(fate[pair])
+                closed.add(fate[pair])
         if not new:
             break
         graph = loop_closing.close(builder, new, cfg.loop)

@@ -200,3 +200,18 @@ def test_no_spot_is_near_at_a_reach_of_zero(turn):
     scene, _, map_ = turn
     builder = MapBuilder.from_map(scene.features, map_)
     assert loop_closing.find_near(builder, PlaceIndex(scene.words, builder.kf.frame), LoopConfig(near=0.0)) == []
+
+
+@pytest.mark.parametrize("span", [0, 3, 10])
+def test_claims_cover_what_is_near_any_of_them(span):
+    rng = np.random.default_rng(span)
+    pairs = [loop_closing.Candidate(int(i), int(j), 0.5) for i, j in rng.integers(0, 60, (150, 2))]
+    claims, kept = loop_closing.Claims(pairs[:10], span=span), pairs[:10]
+    for c in pairs[10:]:
+        is_near = any(loop_closing.is_near(c, other, span=span) for other in kept)
+        assert claims.cover(c) == is_near
+        if not is_near:
+            claims.add(c)
+            kept.append(c)
+    assert 10 < len(kept) <= len(pairs)
+    assert loop_closing.spread(pairs[10:], span=span)[0] is pairs[10]
