@@ -26,6 +26,7 @@ from slamcli.stages import NAMES
 
 if TYPE_CHECKING:
     from slamcli.datasets import Dataset
+    from slamcli.evaluation.map_verdict import Verdict
     from slamcli.evaluation.trajectory_error import Ape, Rpe
     from slamcli.formats.cloud import Points
     from slamcli.geometry.camera import Camera
@@ -218,6 +219,12 @@ class Run:
         from slamcli.schema import Features
 
         return len(self.directory.load(Features, "extract").stamp)
+
+    def verdict(self) -> "Verdict | None":
+        """Judge whether a robot could use the map, and why not; None while there is no grid."""
+        from slamcli.evaluation import map_verdict
+
+        return map_verdict.of_run(self.directory)
 
     def report(self, path: str | os.PathLike[str] | None = None) -> Path:
         """Write one self-contained HTML page about the run, to ``report.html`` in its directory unless `path` is given."""

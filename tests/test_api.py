@@ -81,6 +81,12 @@ def test_what_a_run_made_is_read_in_the_level_frame(room_run: Path) -> None:
     assert run.summary()["extract"]["frames"] == len(run.dataset())
 
 
+def test_a_map_is_judged(room_run: Path) -> None:
+    verdict = slamcli.open_run(room_run).verdict()
+    assert verdict is not None and not verdict.is_usable
+    assert verdict.findings[0].cause == "floor never seen"
+
+
 def test_errors_against_the_truth(room_run: Path) -> None:
     run = slamcli.open_run(room_run)
     ape, rpe = run.ape(), run.rpe("track", seconds=None)

@@ -97,7 +97,8 @@ def _tell_made(rundir: "RunDir") -> None:
         for name, told in (*placement.lines(where), ("map", verdict.summary)):
             console.say(f"{name:<10}  {told}")
         for finding in verdict.findings:
-            console.say(console.amber(f"{'amber' if finding.is_grave else 'note':<10}  {finding}"))
+            console.say(console.amber(f"{'amber' if finding.is_grave else 'note':<10}  {finding.message}"))
+            console.say(console.amber(f"{'':<10}  -> {finding.remedy}"))
     console.say("next: " + "\n      ".join(summary.next_commands(rundir)))
 
 

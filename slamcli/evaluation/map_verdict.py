@@ -57,8 +57,7 @@ class Verdict:
     def summary(self) -> str:
         """Return the figures in one line."""
         e = self.evidence
-        floor = f"floor seen in {e.views_with_floor} of {e.views} views"
-        return f"{e.free_area:.1f} m2 of free floor, {e.path_known:.0%} of the camera's path in known space, {floor}"
+        return f"{e.free_area:.1f} m2 of free floor; {e.path_known:.0%} of the path known; floor seen in {e.views_with_floor} of {e.views} views"
 
     def to_dict(self) -> dict[str, Any]:
         """Return everything as plain values; what could not be measured is null."""

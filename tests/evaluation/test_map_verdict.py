@@ -1,6 +1,7 @@
 """A map is judged by what was seen: each simulated fault gets its cause, sound drives get none, and the measures keep their laws."""
 
 import json
+import shutil
 from dataclasses import replace
 from functools import cache
 
@@ -17,7 +18,7 @@ from slamcli.evaluation.map_evidence import View
 from slamcli.evaluation.map_verdict import DOUBLED, HOLES, NO_FLOOR, SMALL, TOO_HIGH, WALL, Verdict
 from slamcli.navigation.grid import build_grid
 from slamcli.runs.run_directory import RunDir
-from slamcli.schema import Grid
+from slamcli.schema import Grid, Ground
 
 SETTINGS, SENSOR = GridConfig(), SensorConfig()
 
@@ -170,3 +171,18 @@ def test_a_run_is_judged(room_run) -> None:
     assert verdict.evidence.views_doubled == 0
     assert 0.0 < verdict.evidence.missing < 0.2
     assert causes(verdict) == [NO_FLOOR]  # it looks into a corner; its floor is not found
+
+
+def test_the_end_of_a_run_tells_start_frames_and_verdict(slamcli, room_run, here) -> None:
+    shutil.copytree(room_run, here / "runs" / "room")
+    told = slamcli("run", "-r", "room").stderr.splitlines()
+    assert "start       x 0.00 m, y 0.00 m, yaw 0.000 rad in the maps' frame" in told
+    T_lw = RunDir.find("room").load(Ground, "densify").T_lw
+    line = next(line for line in told if line.startswith("T_lw"))
+    np.testing.assert_allclose([float(word) for word in line.split()[1:4]], T_lw[:3, 3], atol=1e-4)
+    amber = told.index("amber       floor seen in 0 of 40 views")
+    assert told[amber + 1].strip() == "-> tilt the camera down until the floor 1 to 2 m ahead is in the picture"
+    made = json.loads(slamcli("run", "-r", "room", "--json").stdout)
+    assert made["map"]["findings"][0]["cause"] == NO_FLOOR
+    np.testing.assert_allclose(made["frames"]["T_lw"], T_lw)
+    assert made["frames"]["first"] == {"x": 0.0, "y": 0.0, "yaw": 0.0}
