@@ -291,7 +291,7 @@ def test_a_recording_that_fails_says_why_is_not_tried_again_and_leaves_the_other
     (recordings[1] / "rgb.txt").write_text("")
     tries = []
     original = Desk.run_stage
-    monkeypatch.setattr(Desk, "run_stage", lambda self, stage: tries.append(self.job.name) or original(self, stage))
+    monkeypatch.setattr(Desk, "run_stage", lambda self, *given: tries.append(self.job.name) or original(self, *given))
     rows = run_inside(inside, here / "runs", [*map(str, recordings), "tum/none"])
     assert [row["state"] for row in rows] == ["done", "failed", "failed"]
     assert "rgb.txt" in rows[1]["reason"]
@@ -304,10 +304,10 @@ def test_what_a_machine_did_wrong_is_tried_again_a_limited_number_of_times(
     def failing(times: int):
         left = iter(range(times))
 
-        def run_stage(self: Desk, stage: str) -> Done:
+        def run_stage(self: Desk, *given) -> Done:
             if next(left, None) is not None:
                 raise OSError(28, "No space left on device")
-            return original(self, stage)
+            return original(self, *given)
 
         return run_stage
 
