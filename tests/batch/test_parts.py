@@ -7,6 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+pytest.importorskip("distributed", reason="batches need Dask: pip install 'slamcli[cluster]'")
+
 from slamcli.batch import jobs, worker
 from slamcli.batch.jobs import Order
 from slamcli.batch.worker import Part, part_rows
