@@ -40,6 +40,7 @@ def local(workers: int, memory: int, *, progress: Progress = silent, tell: Tell 
 
     compilation.ensure(progress=progress, tell=tell)  # once, and not by every worker at the same time
     options = {"n_workers": workers, "threads_per_worker": 1, "memory_limit": memory, "dashboard_address": None}
+    options |= {"silence_logs": logging.CRITICAL}
     with LocalCluster(processes=True, host="127.0.0.1", **options) as cluster, Client(cluster) as client:
         yield client
 
@@ -115,7 +116,10 @@ def _row(job: Job, end: "Future") -> dict[str, Any]:
     """Take over the row that a worker made; of a task that could not be ended, the exception's first line is the reason."""
     if end.status == "finished":
         return end.result()
-    reason = _first_line(end.exception())
+    error = end.exception()
+    reason = _first_line(error)
+    if type(error).__name__ == "KilledWorker":  # by the system, for want of memory, or by its nanny for the same
+        reason = "every worker that tried it died, perhaps for want of memory; give workers more, or start fewer with --workers"
     return {"recording": job.recording, "run": job.run, "state": "failed", "reason": reason}
 
 

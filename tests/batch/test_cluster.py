@@ -9,6 +9,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from click.testing import Result
@@ -318,6 +319,13 @@ def test_what_a_machine_did_wrong_is_tried_again_a_limited_number_of_times(
     monkeypatch.setattr(Desk, "run_stage", failing(3))
     (row,) = run_inside(inside, here / "runs", [str(recordings[1])], retries=2)
     assert row["state"] == "failed" and "No space left on device" in row["reason"]
+
+
+def test_a_recording_that_kills_its_workers_fails_with_a_hint(inside: distributed.Client, recordings: list[Path], here: Path) -> None:
+    (job,) = jobs.jobs([str(recordings[0])], Order(out=str(here / "runs")))
+    error = distributed.KilledWorker(task="run_stage-1", last_worker=SimpleNamespace(address="tcp://127.0.0.1:1"), allowed_failures=3)
+    row = cluster._row(job, SimpleNamespace(status="error", exception=lambda: error))
+    assert row["state"] == "failed" and "for want of memory" in row["reason"]
 
 
 def test_a_worker_that_does_not_see_the_folder_says_so(inside: distributed.Client, recordings: list[Path], here: Path) -> None:
