@@ -1,7 +1,7 @@
 #!/usr/bin/env python
 """Kill a worker, the client and the scheduler of a batch at random moments, and see whether the batch is whole in the end.
 
-    python scripts/batch_kills.py OUT [--kills 20] [--recordings 3] [--frames 30] [--seed 0]
+    python scripts/batch_kills.py OUT [--victims worker client scheduler] [--kills 20] [--recordings 3] [--frames 30] [--seed 0]
 
 Small simulated recordings are run once by `slamcli.run`; then, for each kill, as a batch on a scheduler and two workers of the loopback.
 At a random moment between the start and the end of an undisturbed batch one process dies by SIGKILL and is started again; the batch is
@@ -110,6 +110,7 @@ def main() -> None:
     """Make the recordings, kill, print the table; status 1 when a batch was not whole."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path)
+    parser.add_argument("--victims", nargs="+", choices=VICTIMS, default=VICTIMS)
     parser.add_argument("--kills", type=int, default=20, help="of each victim")
     parser.add_argument("--recordings", type=int, default=3)
     parser.add_argument("--frames", type=int, default=30)
@@ -126,7 +127,7 @@ def main() -> None:
         start = time.monotonic()
         batch(cluster, recordings, given.out / "undisturbed2")
         duration = time.monotonic() - start
-        for victim in VICTIMS:
+        for victim in given.victims:
             found = [one(cluster, victim, rng.uniform(0.0, duration), recordings, reference, given.out) for _ in range(given.kills)]
             rows.append([victim, str(len(found)), *(str(sum(column)) for column in zip(*found, strict=True))])
             print(table(rows, right=range(1, 5)), flush=True)

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
-from slamcli.batch import worker
+from slamcli.batch import storage, worker
 from slamcli.batch.jobs import Job
 from slamcli.console import Progress, Tell, silent
 from slamcli.errors import SlamError
@@ -40,6 +40,7 @@ def local(workers: int, memory: int, *, progress: Progress = silent, tell: Tell 
 
     compilation.ensure(progress=progress, tell=tell)  # once, and not by every worker at the same time
     options = {"n_workers": workers, "threads_per_worker": 1, "memory_limit": memory, "dashboard_address": None}
+    options |= {"silence_logs": logging.CRITICAL}
     with LocalCluster(processes=True, host="127.0.0.1", **options) as cluster, Client(cluster) as client:
         yield client
 
@@ -91,11 +92,13 @@ def work_off(client: "Client", jobs: Sequence[Job], *, retries: int = RETRIES, p
     ends: dict[Any, Job] = {}  # by the key of the future that closes it
     futures: list[Future] = []
     here = worker.identity()
+    n_parts = len(client.nthreads()) // max(1, len(jobs))  # of a recording, where workers would be idle
     for place, job in enumerate(jobs):
         options = {"priority": -place, "retries": retries, "pure": False}
+        parts = [client.submit(worker.extract_part, job, k, n_parts, here, **options) for k in range(n_parts if n_parts > 1 else 0)]
         last: Future | None = None
         for stage in job.stages:
-            last = client.submit(worker.run_stage, job, stage, last, here, **options)
+            last = client.submit(worker.run_stage, job, stage, last, here, parts if stage == job.stages[0] else (), **options)
             futures.append(last)
         futures.append(client.submit(worker.finish, job, last, **options))
         ends[futures[-1].key] = job
@@ -103,14 +106,20 @@ def work_off(client: "Client", jobs: Sequence[Job], *, retries: int = RETRIES, p
         if future.status in ("cancelled", "lost"):
             raise SlamError("the connection to the scheduler is lost; start it again and give the same command: what is done is kept")
         if future.key in ends:
-            yield _row(ends[future.key], future)
+            job = ends[future.key]
+            if storage.is_url(job.run) or storage.is_url(job.recording):
+                client.run(worker.clear, job, on_error="ignore")  # on all of them: any may have had a task of this recording
+            yield _row(job, future)
 
 
 def _row(job: Job, end: "Future") -> dict[str, Any]:
     """Take over the row that a worker made; of a task that could not be ended, the exception's first line is the reason."""
     if end.status == "finished":
         return end.result()
-    reason = _first_line(end.exception())
+    error = end.exception()
+    reason = _first_line(error)
+    if type(error).__name__ == "KilledWorker":  # by the system, for want of memory, or by its nanny for the same
+        reason = "every worker that tried it died, perhaps for want of memory; give workers more, or start fewer with --workers"
     return {"recording": job.recording, "run": job.run, "state": "failed", "reason": reason}
 
 

@@ -52,6 +52,12 @@ class Meter:
             self._watch = _compiler_watch(tell)
             event.register("numba:compile", self._watch)
 
+    def add(self, *, seconds: float, cpu_seconds: float, peak_rss_mb: float) -> None:
+        """Count what a part of the work has cost elsewhere."""
+        self.seconds += seconds
+        self.cpu_seconds += cpu_seconds
+        self.peak_rss_mb = max(self.peak_rss_mb, peak_rss_mb)
+
     def _sample(self) -> None:
         while True:
             self.peak_rss_mb = max(self.peak_rss_mb, _resident_mb())

@@ -7,6 +7,7 @@ import math
 import platform
 import zlib
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -113,6 +114,16 @@ class Tools:
         return np.random.default_rng([self._seed, zlib.crc32(self._stage.encode())])
 
 
+@dataclass(frozen=True)
+class Begun:
+    """A stage of which a part was done elsewhere: how it goes on from there, and what that part has cost."""
+
+    go_on: Callable[..., Mapping[str, Any]]  # in place of the stage's own `run`
+    seconds: float
+    cpu_seconds: float
+    peak_rss_mb: float
+
+
 class Pipeline:
     """The stages of one run under one configuration."""
 
@@ -201,8 +212,8 @@ class Pipeline:
                 )
         self.run_stage(stage)
 
-    def run_stage(self, stage: Stage) -> None:
-        """Run one stage and put its folder in place; whatever goes wrong, the result before stays."""
+    def run_stage(self, stage: Stage, *, begun: Begun | None = None) -> None:
+        """Run one stage, or end one that was begun elsewhere, and put its folder in place; if it fails, the result before stays."""
         inputs = {name: self._present_input(name) for name in (*stage.needs, *staleness.named_files(stage, self.config))}
         tools = Tools(stage.name, self.config, self._progress)
         if stage is STAGES[0]:  # the record of the first stage is where the recording's own faults belong
@@ -214,11 +225,14 @@ class Pipeline:
                 with Meter() as meter, one_thread_in_blas():
                     module = importlib.import_module(f"slamcli.stages.{stage.name}")
                     meter.watch_compiler(self._tell)
-                    summary = module.run(Inputs(stage, self.run, self.dataset), out, Settings(stage, self.config), tools)
+                    run = module.run if begun is None else begun.go_on
+                    summary = run(Inputs(stage, self.run, self.dataset), out, Settings(stage, self.config), tools)
             except (KeyboardInterrupt, SystemError) as error:
                 if (found := interruption.found_in(error)) is None:
                     raise
                 raise interruption.Interrupted(found.number, f" in {stage.name}; earlier stages are kept") from None
+            if begun is not None:
+                meter.add(seconds=begun.seconds, cpu_seconds=begun.cpu_seconds, peak_rss_mb=begun.peak_rss_mb)
             record = self._record(stage, inputs, run_directory.outputs(out), meter, tools, summary)
             self.run.commit(stage.name, out, record)
         log.debug("%s", record)

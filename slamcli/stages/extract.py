@@ -1,5 +1,6 @@
 """extract: images -> ORB features with depth."""
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -20,7 +21,7 @@ from slamcli.vision import optical_flow, orb
 
 
 @dataclass(frozen=True)
-class _Frame:
+class Frame:
     """What one frame gives."""
 
     points: orb.KeyPoints
@@ -32,9 +33,19 @@ class _Frame:
 
 def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
     """Detect ORB features in every colour frame and read their depth."""
+    n = len(inputs.dataset)
+    found = frames(inputs.dataset, cfg.extract, range(n), workers=tools.workers)
+    return assemble(list(tools.progress(found, "extract", n)), inputs, out, cfg, tools)
+
+
+def frames(dataset: Dataset, settings: ExtractConfig, rows: Sequence[int], *, workers: int) -> Iterator[Frame]:
+    """Extract some frames, in order. No frame depends on another, so that they may be divided among processes."""
+    return ordered_map(partial(_extract, dataset, settings), rows, workers=workers)
+
+
+def assemble(found: list[Frame], inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
+    """Write what was found in each frame of the recording."""
     dataset, camera = inputs.dataset, inputs.dataset.camera
-    frames = ordered_map(partial(_extract, dataset, cfg.extract), range(len(dataset)), workers=tools.workers)
-    found = list(tools.progress(frames, "extract", len(dataset)))
     for i, frame in enumerate(found):
         for fault in frame.faults:
             tools.warn(f"frame {i} skipped: {fault}" if len(frame.points) == 0 else f"frame {i} has no depth: {fault}")
@@ -62,13 +73,13 @@ def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
     }
 
 
-def _extract(dataset: Dataset, settings: ExtractConfig, i: int) -> _Frame:
+def _extract(dataset: Dataset, settings: ExtractConfig, i: int) -> Frame:
     """Detect the features of frame i; an image that cannot be used gives none, or none with depth."""
     faults = []
     try:
         grey = dataset.grey(i)
     except BadFrame as error:
-        return _Frame(orb.no_key_points(), np.zeros(0, np.float32), np.zeros((0, 2), np.float32), None, [str(error)])
+        return Frame(orb.no_key_points(), np.zeros(0, np.float32), np.zeros((0, 2), np.float32), None, [str(error)])
     points = detect(grey, settings)
     try:
         depth = dataset.depth(i)
@@ -77,11 +88,11 @@ def _extract(dataset: Dataset, settings: ExtractConfig, i: int) -> _Frame:
         faults.append(str(error))
     if depth is None:
         nowhere = np.full(len(points), np.nan, np.float32)
-        return _Frame(points, nowhere, slope=np.zeros((len(points), 2), np.float32), coarse=None, faults=faults)
+        return Frame(points, nowhere, slope=np.zeros((len(points), 2), np.float32), coarse=None, faults=faults)
     read = at_key_points.depth_at(depth, points.xy, window=settings.depth_window)
     if settings.depth_jump:
         read = np.where(at_key_points.is_behind_outline(depth, points.xy, jump=settings.depth_jump), np.float32(np.nan), read)
-    return _Frame(points, read, at_key_points.inverse_depth_slope(depth, points.xy), icp.coarse(depth), faults)
+    return Frame(points, read, at_key_points.inverse_depth_slope(depth, points.xy), icp.coarse(depth), faults)
 
 
 def detect(grey: np.ndarray, settings: ExtractConfig) -> orb.KeyPoints:
@@ -102,7 +113,7 @@ def detect(grey: np.ndarray, settings: ExtractConfig) -> orb.KeyPoints:
     )
 
 
-def _table(dataset: Dataset, camera: Camera, found: list[_Frame], scale: float) -> Features:
+def _table(dataset: Dataset, camera: Camera, found: list[Frame], scale: float) -> Features:
     points = [frame.points for frame in found]
     raw = np.concatenate([p.xy for p in points])
     return Features(
@@ -119,7 +130,7 @@ def _table(dataset: Dataset, camera: Camera, found: list[_Frame], scale: float) 
     )
 
 
-def _coarse_table(camera: Camera, found: list[_Frame]) -> CoarseDepth:
+def _coarse_table(camera: Camera, found: list[Frame]) -> CoarseDepth:
     coarse = np.zeros((len(found), *icp.coarse_shape(camera)), dtype=np.uint16)
     for i, frame in enumerate(found):
         if frame.coarse is not None:
@@ -127,7 +138,7 @@ def _coarse_table(camera: Camera, found: list[_Frame]) -> CoarseDepth:
     return CoarseDepth(coarse_depth=coarse)
 
 
-def _flow_table(dataset: Dataset, camera: Camera, found: list[_Frame], tools: Tools) -> Flow:
+def _flow_table(dataset: Dataset, camera: Camera, found: list[Frame], tools: Tools) -> Flow:
     """Follow the key points of every frame into the next one."""
 
     def follow(i: int) -> np.ndarray:

@@ -9,6 +9,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from click.testing import Result
@@ -291,7 +292,7 @@ def test_a_recording_that_fails_says_why_is_not_tried_again_and_leaves_the_other
     (recordings[1] / "rgb.txt").write_text("")
     tries = []
     original = Desk.run_stage
-    monkeypatch.setattr(Desk, "run_stage", lambda self, stage: tries.append(self.job.name) or original(self, stage))
+    monkeypatch.setattr(Desk, "run_stage", lambda self, *given: tries.append(self.job.name) or original(self, *given))
     rows = run_inside(inside, here / "runs", [*map(str, recordings), "tum/none"])
     assert [row["state"] for row in rows] == ["done", "failed", "failed"]
     assert "rgb.txt" in rows[1]["reason"]
@@ -304,10 +305,10 @@ def test_what_a_machine_did_wrong_is_tried_again_a_limited_number_of_times(
     def failing(times: int):
         left = iter(range(times))
 
-        def run_stage(self: Desk, stage: str) -> Done:
+        def run_stage(self: Desk, *given) -> Done:
             if next(left, None) is not None:
                 raise OSError(28, "No space left on device")
-            return original(self, stage)
+            return original(self, *given)
 
         return run_stage
 
@@ -318,6 +319,13 @@ def test_what_a_machine_did_wrong_is_tried_again_a_limited_number_of_times(
     monkeypatch.setattr(Desk, "run_stage", failing(3))
     (row,) = run_inside(inside, here / "runs", [str(recordings[1])], retries=2)
     assert row["state"] == "failed" and "No space left on device" in row["reason"]
+
+
+def test_a_recording_that_kills_its_workers_fails_with_a_hint(inside: distributed.Client, recordings: list[Path], here: Path) -> None:
+    (job,) = jobs.jobs([str(recordings[0])], Order(out=str(here / "runs")))
+    error = distributed.KilledWorker(task="run_stage-1", last_worker=SimpleNamespace(address="tcp://127.0.0.1:1"), allowed_failures=3)
+    row = cluster._row(job, SimpleNamespace(status="error", exception=lambda: error))
+    assert row["state"] == "failed" and "for want of memory" in row["reason"]
 
 
 def test_a_worker_that_does_not_see_the_folder_says_so(inside: distributed.Client, recordings: list[Path], here: Path) -> None:
