@@ -86,7 +86,8 @@ def make(folder: Path, *, seed: int = 0, frames: int = 90, n_lost: int = 6, with
             if stage.name == "densify":
                 write_ply(out / "cloud.ply", *_cloud(rng))
             if stage.name in ("track", "optimize", "loop"):
-                write_tum(out / "trajectory.txt", trajectory(stamp, results[stage.name][0], results[stage.name][-1]))
+                tracks, map_ = (next(value for value in results[stage.name] if isinstance(value, kind)) for kind in (Tracks, Map))
+                write_tum(out / "trajectory.txt", trajectory(stamp, tracks, map_))
             run.commit(stage.name, out, _record(run, stage, out, frames))
         if stage.name == until:
             break
@@ -158,5 +159,5 @@ def _record(run: RunDir, stage: pipeline.Stage, out: Path, frames: int) -> dict:
         "config": declared, "inputs": inputs, "code": code, "outputs": files,
         "digest": digest({name: entry["sha256"] for name, entry in files.items()}), "environment": pipeline.environment(),
         "seconds": 1.5, "cpu_seconds": 2.0, "compile_seconds": 0.0, "fps": frames / 1.5, "peak_rss_mb": 200.0,
-        "summary": {"frames": frames}, "warnings": [], "n_warnings": 0,
+        "summary": {"frames": frames}, "warnings": [], "n_warnings": 0, "reader": "tum",
     }  # fmt: skip

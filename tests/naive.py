@@ -126,7 +126,7 @@ def normals(points: np.ndarray) -> np.ndarray:
     return out
 
 
-def sorted_points(depth, rays, T, corner, stride, cell, near, far, low, high, drop, base, quadratic, side):
+def sorted_points(depth, rays, T, corner, stride, above, cell, near, far, low, high, drop, base, quadratic, side):
     """Band points, their height slices, floor marks, holes and tops per cell, one pixel at a time."""
     n_band, layers = np.zeros((side, side), int), np.zeros((side, side), np.uint16)
     top, floor, hole = np.zeros((side, side), bool), np.zeros((side, side), int), np.zeros((side, side), int)
@@ -140,10 +140,10 @@ def sorted_points(depth, rays, T, corner, stride, cell, near, far, low, high, dr
 
     def is_level(v, u, x, slope):
         """Upright surfaces rise from row to row by what the rows are apart."""
-        if slope[2] >= 0 or v < stride:
+        if slope[2] >= 0 or v < above:
             return False
-        row_apart = z * (T[2, :3] @ np.array([*rays[v - stride, u].astype(float), 1.0]) - slope[2])
-        return abs(point(v - stride, u)[2] - x[2]) < 0.5 * row_apart
+        row_apart = z * (T[2, :3] @ np.array([*rays[v - above, u].astype(float), 1.0]) - slope[2])
+        return abs(point(v - above, u)[2] - x[2]) < 0.5 * row_apart
 
     for v in range(stride // 2, depth.shape[0], stride):
         for u in range(stride // 2, depth.shape[1], stride):

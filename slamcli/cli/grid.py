@@ -39,9 +39,23 @@ class Place(click.ParamType):
 @click.argument("out", type=Target())
 @run_option
 @click.option("--png", type=Target(), help="Also draw a picture with the trajectory, a scale bar and a legend.")
+@click.option("--costs", type=Target(), help="Also write inflation costs (.pgm or .png, mode: scale).")
+@click.option("--reach", default=0.55, show_default=True, help="Of the costs, from an obstacle's edge [m].")
+@click.option(
+    "--falloff", default=10.0, show_default=True, help="Of the costs beyond the robot's radius: nav2's cost_scaling_factor [1/m]."
+)
+@click.option("--radius", type=float, help="Of the robot, for the costs [m]. [default: the run's robot.radius]")
+@click.option(
+    "--keep-out",
+    type=click.Path(path_type=Path, dir_okay=False, exists=True),
+    help="Polygons, JSON [[[x, y], ...], ...] in metres, or a PNG of the grid's size, not black where to keep out: also write OUT_keepout.",
+)
 @mount_option
 @json_option
-def export_grid(out: Path, run: str | None, png: Path | None, mount: tuple[float, ...] | None, as_json: bool) -> None:
+def export_grid(
+    out: Path, run: str | None, png: Path | None, costs: Path | None, reach: float, falloff: float, radius: float | None,
+    keep_out: Path | None, mount: tuple[float, ...] | None, as_json: bool,
+) -> None:  # fmt: skip
     """Write the navigation grid OUT (.pgm) and its page (.yaml) beside it, for map_server and nav2.
 
     The page's first line tells where the recording began: a robot's initial pose there, with --mount that of its base.
@@ -49,10 +63,12 @@ def export_grid(out: Path, run: str | None, png: Path | None, mount: tuple[float
     \b
       slamcli export-grid map.pgm --png map.png
       slamcli export-grid map.pgm --mount 0.1,0,0.3,0,0.2,0
+      slamcli export-grid map.pgm --costs costs.pgm --keep-out no_go.json
     """
     import numpy as np
 
-    from slamcli.formats import grid_map
+    from slamcli.formats import cost_map, grid_map
+    from slamcli.navigation import cost_layers
     from slamcli.runs.run_directory import RunDir
     from slamcli.schema import Grid
 
@@ -67,6 +83,13 @@ def export_grid(out: Path, run: str | None, png: Path | None, mount: tuple[float
 
         save_picture(png, grid, trajectory=camera_path(folder), title=str(folder.info()["dataset"]))
         written = (*written, png)
+    place = {"origin": grid_map.GridMap.of(grid).origin, "resolution": grid_map.GridMap.of(grid).resolution}
+    if costs is not None:
+        radius = folder.config().robot.radius if radius is None else radius
+        written = (*written, *cost_map.write(costs, cost_layers.inflated(grid, radius=radius, reach=reach, falloff=falloff), **place))
+    if keep_out is not None:
+        is_kept_out = _kept_out(grid, keep_out)
+        written = (*written, *cost_map.write(out.with_name(f"{out.stem}_keepout.pgm"), 100 * is_kept_out.astype(np.int16), **place))
     rows, columns = grid.state.shape
     if as_json:
         about = {"out": [str(path) for path in written], "columns": columns, "rows": rows, "resolution": float(grid.resolution)}
@@ -75,6 +98,22 @@ def export_grid(out: Path, run: str | None, png: Path | None, mount: tuple[float
         )
         return
     click.echo(f"{', '.join(str(path) for path in written)}: {columns} x {rows} cells of {float(grid.resolution):g} m", err=True)
+
+
+def _kept_out(grid: Grid, path: Path) -> np.ndarray:
+    """Read polygons or a drawn picture as cells (H, W) bool."""
+    from slamcli.formats.mask import read_mask
+    from slamcli.navigation import cost_layers
+
+    if path.suffix.lower() != ".json":
+        return read_mask(path, grid.state.shape)[::-1]
+    try:
+        polygons = json.loads(path.read_text(encoding="utf-8"))
+        return cost_layers.inside_polygons(grid, polygons)
+    except (ValueError, TypeError, RecursionError) as error:
+        raise SlamError(f"{path}: not a list of polygons [[[x, y], ...], ...]") from error
+    except SlamError as error:
+        raise SlamError(f"{path}: {error}") from error
 
 
 def _start(folder: RunDir, mount: tuple[float, ...] | None) -> tuple[float, float, float]:
@@ -101,7 +140,8 @@ def _start(folder: RunDir, mount: tuple[float, ...] | None) -> tuple[float, floa
 @click.option(
     "--start", type=Place(), required=True, help="Where the robot is, such as 0.5,1.0 [m], or first or last: below the camera there."
 )
-@click.option("--goal", type=Place(), required=True, help="Where it is to go: x,y [m], first or last.")
+@click.option("--goal", type=Place(), help="Where it is to go: x,y [m], first or last.")
+@click.option("--reachable", is_flag=True, help="Tell instead of a path how much of the free floor it can get to, and draw it.")
 @run_option
 @click.option("--map", "page", type=click.Path(path_type=Path, dir_okay=False), help="Plan on this grid map (.yaml) instead of the run's.")
 @click.option("--radius", type=float, help="Of the robot [m]. [default: the run's robot.radius]")
@@ -112,7 +152,8 @@ def _start(folder: RunDir, mount: tuple[float, ...] | None) -> tuple[float, floa
 @click.option("--png", type=Target(own="plan.png"), help="Draw the path. [default: plan.png in the run directory]")
 @json_option
 def plan(
-    start: tuple[float, float] | str, goal: tuple[float, float] | str, run: str | None, page: Path | None, radius: float | None, clearance: float,
+    start: tuple[float, float] | str, goal: tuple[float, float] | str | None, reachable: bool, run: str | None, page: Path | None,
+    radius: float | None, clearance: float,
     weight: float, allow_unknown: bool, out: Path | None, png: Path | None, as_json: bool,
 ) -> None:  # fmt: skip
     """Plan a path on the navigation grid and draw it; prints it as CSV: x,y,clearance in metres, level frame.
@@ -123,6 +164,7 @@ def plan(
       slamcli plan --start first --goal last
       slamcli plan --start 0.5,1.0 --goal 3,2
       slamcli plan --start 0.5,1.0 --goal 3,2 -o path.json --png path.png
+      slamcli plan --start first --reachable --radius 0.3
     """
     from slamcli.config.options import Config
     from slamcli.navigation import planner
@@ -142,6 +184,12 @@ def plan(
     else:
         grid, title = _read_map(page), page.name
     radius = Config().robot.radius if radius is None else radius
+    if reachable:
+        start, _ = _ends(grid, start, start, trajectory, radius=radius, allow_unknown=allow_unknown)
+        _tell_reachable(grid, start, radius, allow_unknown, png, as_json)
+        return
+    if goal is None:
+        raise click.UsageError("give --goal, or --reachable")
     start, goal = _ends(grid, start, goal, trajectory, radius=radius, allow_unknown=allow_unknown)
     route = planner.plan(grid, start, goal, radius=radius, clearance=clearance, weight=weight, allow_unknown=allow_unknown)
     texts = {".csv": _csv(route), ".json": _json(route, start, goal, radius)}
@@ -153,6 +201,31 @@ def plan(
     least = f"{float(route.clearance.min()) + radius:.2f} m"
     picture = f"; drawn in {png}" if png else ""
     click.echo(f"{route.length:.2f} m, never nearer than {least} to what is not free{picture}", err=True)
+
+
+def _tell_reachable(grid: Grid, start: tuple[float, float], radius: float, allow_unknown: bool, png: Path | None, as_json: bool) -> None:
+    """Print the area that a robot can get to from `start`, and draw what of the free floor it cannot."""
+    import numpy as np
+
+    from slamcli.navigation import cost_layers
+    from slamcli.schema import Grid
+    from slamcli.visualization.grid_picture import save_picture
+
+    cells = cost_layers.reachable(grid, start, radius=radius, allow_unknown=allow_unknown)
+    swept = cost_layers.swept(grid, cells, radius=radius)
+    area, free = float(grid.resolution) ** 2, grid.state == 0
+    told = {
+        "start": list(start),
+        "radius": radius,
+        "reachable_m2": round(float((swept & free).sum()) * area, 3),
+        "free_m2": round(float(free.sum()) * area, 3),
+    }
+    if png is not None:
+        seen = Grid(grid.p_occupied, grid.n_seen, np.where(free & ~swept, -1, grid.state).astype(np.int8), grid.origin, grid.resolution)
+        save_picture(png, seen, title=f"white: within reach of a robot of {radius:g} m radius")
+    drawn = f"; drawn in {png}" if png else ""
+    text = f"{told['reachable_m2']:.1f} of {told['free_m2']:.1f} m2 of free floor are within reach{drawn}"
+    click.echo(json.dumps(told) if as_json else text)
 
 
 def _ends(

@@ -14,6 +14,7 @@ SLICES = 16  # of the band's height, one bit each
 ALL_SLICES = (1 << SLICES) - 1
 NOT_SEEN, PASSED, SEEN = 0, 1, 2  # of a cell's floor: PASSED is a line of sight below the band, which ends on the floor farther on
 HOLE_POINTS = 2  # readings through the floor's plane that make a cell a hole: one may be a slip
+ROWS = 120  # of an image: a surface is level by a pixel this share above; a nearer one would show the noise instead of the slope
 OPEN_STRIDE = 2  # open lines of sight are followed at every so many of the pixels whose points are sorted
 TOP_REACH = 0.3  # [m] above the band: what is seen there from above may be the top of something that reaches into the band
 
@@ -52,7 +53,19 @@ def look(depth: np.ndarray, rays: np.ndarray, T_lk: np.ndarray, *, settings: Gri
     of_view = (depth, rays, T_lk, centre - half)
     of_settings = (cell, settings.min_range, settings.max_range, settings.band_low, settings.band_high)
     of_sensor = (sensor.depth_noise_base, sensor.depth_noise_quadratic)
-    _sort_points(*of_view, settings.stride, *of_settings, settings.drop, *of_sensor, n_band, slices, floor, hole, top)
+    _sort_points(
+        *of_view,
+        settings.stride,
+        max(settings.stride, depth.shape[0] // ROWS),
+        *of_settings,
+        settings.drop,
+        *of_sensor,
+        n_band,
+        slices,
+        floor,
+        hole,
+        top,
+    )
     _cross(*of_view, OPEN_STRIDE * settings.stride, *of_settings, *of_sensor, crossed)
     if settings.extend_down:
         _extend_down(depth, rays, T_lk, centre - half, settings, n_band, slices)
@@ -79,6 +92,7 @@ def _sort_points(
     T: f8[:, ::1],
     corner: f8[::1],
     stride: i8,
+    above: i8,
     cell: f8,
     near: f8,
     far: f8,
@@ -124,17 +138,17 @@ def _sort_points(
             if not (0 <= i < side and 0 <= j < side):
                 continue
             if height >= high:
-                if dz < 0.0 and v >= stride:
-                    dz2 = T[2, 0] * rays[v - stride, u, 0] + T[2, 1] * rays[v - stride, u, 1] + T[2, 2]
-                    if abs(T[2, 3] + depth[v - stride, u] * dz2 - height) < 0.5 * z * (dz2 - dz):
+                if dz < 0.0 and v >= above:
+                    dz2 = T[2, 0] * rays[v - above, u, 0] + T[2, 1] * rays[v - above, u, 1] + T[2, 2]
+                    if abs(T[2, 3] + depth[v - above, u] * dz2 - height) < 0.5 * z * (dz2 - dz):
                         top[i, j] = 1
             elif height >= low + 2.0 * noise:
                 n_band[i, j] += 1
                 slices[i, j] |= np.uint16(1 << int(SLICES * (height - low) / (high - low)))
-            elif height > -low - 2.0 * noise and dz < 0.0 and v >= stride:
-                # The pixel above must be as low, or this is the foot of something upright, which noise may have put behind it.
-                z2 = depth[v - stride, u]
-                dz2 = T[2, 0] * rays[v - stride, u, 0] + T[2, 1] * rays[v - stride, u, 1] + T[2, 2]
+            elif height > -low - 2.0 * noise and dz < 0.0 and v >= above:
+                # The pixel `above` must be as low, or this is the foot of something upright, which noise may have put behind it.
+                z2 = depth[v - above, u]
+                dz2 = T[2, 0] * rays[v - above, u, 0] + T[2, 1] * rays[v - above, u, 1] + T[2, 2]
                 if not (abs(T[2, 3] + z2 * dz2 - height) < 0.5 * z * (dz2 - dz)):
                     continue
                 floor[i, j] = SEEN

@@ -42,7 +42,7 @@ def plan(
         if not (np.isfinite(value) and least <= value <= 100.0):
             raise SlamError(f"{name} = {value:g}: must be from {least:g} to 100")
     margin = obstacle_distance(grid, allow_unknown=allow_unknown) - radius
-    ends = [_end_cell(grid, margin, name, xy, radius) for name, xy in (("start", start), ("goal", goal))]
+    ends = [end_cell(grid, margin, name, xy, radius) for name, xy in (("start", start), ("goal", goal))]
     cost = _cell_cost(margin, clearance, weight)
     cells = _cheapest(cost, ends[0], ends[1])
     if cells is None:
@@ -109,7 +109,11 @@ def _cells_of(grid: Grid, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return cell[..., 1], cell[..., 0]
 
 
-def _end_cell(grid: Grid, margin: np.ndarray, name: str, xy: tuple[float, float], radius: float) -> tuple[int, int]:
+def end_cell(grid: Grid, margin: np.ndarray, name: str, xy: tuple[float, float], radius: float) -> tuple[int, int]:
+    """Find the cell (row, column) of a path's end; SlamError where the robot has no room there.
+
+    margin : (H, W) m, room beyond the robot's radius
+    """
     rows, columns = grid.state.shape
     high = grid.origin + float(grid.resolution) * np.array([columns, rows])
     place = f"{name} {xy[0]:g},{xy[1]:g}"

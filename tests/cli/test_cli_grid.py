@@ -9,14 +9,14 @@ import pytest
 from boxroom import HANGING, KINECT, kinect_noise, look_along, render, round_trip
 
 from slamcli import artifacts
-from slamcli.config.options import Config, GridConfig
+from slamcli.config.options import Config, GridConfig, RobotConfig
 from slamcli.depth import icp
 from slamcli.errors import BadFrame
 from slamcli.formats import grid_map, octomap
 from slamcli.geometry import se3
 from slamcli.runs import pipeline, placement
 from slamcli.runs.run_directory import RunDir
-from slamcli.schema import CoarseDepth, Features, Grid, Ground, Map, Timing, Tracks
+from slamcli.schema import CoarseDepth, Features, Grid, Ground, Map, Moving, Timing, Tracks
 from slamcli.stages import grid2d, stage_named
 
 
@@ -199,6 +199,7 @@ class Inputs:
                 np.array(1.2),
             ),
             CoarseDepth: CoarseDepth(np.zeros((n, 0, 0), np.uint16)),
+            Moving: Moving(),
             Ground: Ground(T_lw, plane, np.array(0.01), np.array(0.9), np.array(is_found)),
             Timing: Timing(np.array(0.0), np.array(0.0), np.array(0.0), np.zeros((n, 6))),
             Tracks: Tracks(np.where(lost, -1, np.arange(n)).astype(np.int32), T_kc, np.ones(n, np.uint8), np.full(n, 99, np.int32)),
@@ -280,3 +281,52 @@ def test_the_stage_reads_the_octree(tmp_path):
     summary, out, _ = run_stage(tmp_path, Inputs(tmp_path, round_trip(step=2.0, turn=2.0)), source="octree")
     assert summary["columns"] == summary["rows"] == 40
     assert artifacts.load(Grid, out).state[20, 24] == 1
+
+
+def test_costs_and_keep_out_layers_lie_on_the_grid(slamcli, run, tmp_path):
+    (tmp_path / "no.json").write_text("[[[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]]")
+    result = slamcli("export-grid", tmp_path / "m.pgm", "-r", run, "--costs", tmp_path / "c.pgm", "--keep-out", tmp_path / "no.json")
+    assert result.exit_code == 0
+    mask = grid_map.read_pgm(tmp_path / "m_keepout.pgm")[::-1]
+    assert (mask == 0).sum() == 400 and (mask[10:30, 20:40] == 0).all() and set(np.unique(mask)) == {0, 255}
+    costs = grid_map.read_pgm(tmp_path / "c.pgm")[::-1]
+    assert (costs[room_grid().state != 0] == 0).all() and costs.max() == 255
+    drawn = np.zeros((80, 100), np.uint8)
+    drawn[-30:-10, 20:40] = 255  # row 0 is the largest y
+    cv2.imwrite(str(tmp_path / "no.png"), drawn)
+    assert slamcli("export-grid", tmp_path / "n.pgm", "-r", run, "--keep-out", tmp_path / "no.png").exit_code == 0
+    assert (tmp_path / "n_keepout.pgm").read_bytes() == (tmp_path / "m_keepout.pgm").read_bytes()
+    for content in ("{", "[[1, 2]]", "5"):
+        (tmp_path / "no.json").write_text(content)
+        result = slamcli("export-grid", tmp_path / "x.pgm", "-r", run, "--keep-out", tmp_path / "no.json")
+        assert result.exit_code == 1 and "no.json" in result.stderr
+
+
+def test_plan_tells_what_a_robot_can_reach(slamcli, run, tmp_path):
+    wide = json.loads(slamcli("plan", "--start", "0,1", "--reachable", "-r", run, "--json", "--radius", 0.2).stdout)
+    assert 0.9 * wide["free_m2"] < wide["reachable_m2"] < wide["free_m2"]
+    fat = slamcli("plan", "--start", "0,1", "--reachable", "-r", run, "--radius", 0.8, "--png", tmp_path / "reach.png")
+    assert fat.exit_code == 0 and "within reach" in fat.stdout and (tmp_path / "reach.png").stat().st_size > 5000
+    assert (
+        json.loads(slamcli("plan", "--start", "0,1", "--reachable", "-r", run, "--json", "--radius", 0.8).stdout)["reachable_m2"]
+        < 0.7 * wide["free_m2"]
+    )
+    assert slamcli("plan", "--start", "0,0", "-r", run).exit_code == 2
+
+
+def test_a_robot_described_once_is_used_by_plan_and_export(slamcli, run, tmp_path):
+    folder = RunDir(run)
+    before = folder.config()
+    try:
+        folder.write_config(Config(robot=RobotConfig(radius=0.35, mount="0.1,0,0.3,0,0.2,0")))
+        assert json.loads(slamcli("plan", "--start", "0,0", "--goal", "3,0", "-r", run, "--json").stdout)["radius"] == 0.35
+        assert json.loads(slamcli("plan", "--start", "0,0", "--goal", "3,0", "-r", run, "--json", "--radius", 0.1).stdout)["radius"] == 0.1
+        told, given = (
+            slamcli("export-grid", tmp_path / "m.pgm", "-r", run, "--json", *more).stdout for more in ((), ("--mount", "0.1,0,0.3,0,0.2,0"))
+        )
+        assert json.loads(told)["start"] == json.loads(given)["start"]
+        folder.write_config(Config(robot=RobotConfig(mount="here")))
+        result = slamcli("export-grid", tmp_path / "m.pgm", "-r", run)
+        assert result.exit_code == 1 and "robot.mount" in result.stderr
+    finally:
+        folder.write_config(before)

@@ -135,7 +135,7 @@ def test_band_points_floor_holes_and_tops_match_their_slow_twin():
         depth = kinect_noise(render(T), rng)
         corner, side = np.floor(T[:2, 3] / 0.05) - 85, 171
         T[2, 3] += lift
-        args = (corner, 3, 0.05, 0.5, 4.0, 0.05, 0.5, 0.08, 0.0012, 0.0019)
+        args = (corner, 3, 4, 0.05, 0.5, 4.0, 0.05, 0.5, 0.08, 0.0012, 0.0019)
         n_band, layers = np.zeros((side, side), np.int32), np.zeros((side, side), np.uint16)
         floor, hole, top = (np.zeros((side, side), np.uint8) for _ in range(3))
         grid_evidence._sort_points(depth, KINECT.rays, T, *args, n_band, layers, floor, hole, top)
