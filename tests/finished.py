@@ -118,9 +118,9 @@ def _results(rng: np.random.Generator, truth: Trajectory, lost: np.ndarray) -> d
     doubts = Doubt(contradicted=unknown, disagreement=unknown, sigma=sure, is_doubtful=lost.copy())
     return {
         "extract": (features,),
-        "track": (track, maps["track"], Moving()),
+        "track": (track, Moving(), maps["track"]),
         "optimize": (track, when, maps["track"]),
-        "loop": (loop, closures, when, maps["loop"], Moving(), doubts),
+        "loop": (loop, closures, when, Moving(), doubts, maps["loop"]),
         "densify": (ground,),
     }
 

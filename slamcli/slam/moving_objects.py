@@ -23,9 +23,7 @@ from slamcli.slam import moving_object_kernels as kernels
 STEP = 2  # coarse pixels from one place looked at to the next
 AFTER = (0.07, 0.14, 0.2, 0.35, 0.55, 0.8, 1.1)  # [s] before and after a view, of the views that it is compared with
 LONG = 0.3  # [s] apart, from which on what is seen again in its place counts as still: a stride takes 0.5 s
-MIN_THROUGH = 1  # views that look through a place that moves
 MIN_STILL = 2  # views long before or after that find a place again where it is still
-MIN_GROUP = 12  # connected places that move, for one to be believed: less is noise along edges
 TOLERANCE = np.array([0.06, 0.02, 0.008])  # base [m], share of the depth, growth with its square [1/m]: poses err, readings too
 SMOOTH = 0.06  # of the depth, by which neighbours of a place that is compared differ at most: readings at edges hang in the air
 GROUP_JUMP, GROWTH_JUMP = 0.1, 0.05  # of the depth, between neighbouring places of one group and of one surface
@@ -50,6 +48,21 @@ class Views:
 
 
 @dataclass(frozen=True)
+class Rule:
+    """What counts as surely moving."""
+
+    after: tuple[float, ...]  # [s] before and after a view, of the views that it is compared with
+    min_through: int  # views that look through a place
+    weight_still: float  # such views a place needs for each one that finds it again
+    min_group: int  # connected places: less is noise along edges
+
+
+# Poses may rest on what stands a while, but on nothing that moves. Maps show nothing that a later view looks through, and miss no view.
+FOR_POSES = Rule(AFTER, min_through=1, weight_still=1.0, min_group=12)
+FOR_MAPS = Rule((*AFTER, 2.0, 4.0, 8.0, 16.0), min_through=2, weight_still=0.15, min_group=4)
+
+
+@dataclass(frozen=True)
 class Evidence:
     """What other views say of the places (v, u) of one view."""
 
@@ -69,12 +82,12 @@ def is_any(views: Views) -> bool:
     found = 0
     for frame in range(0, len(views.stamp), QUICK_EVERY):
         evidence = weigh(views, frame, QUICK_AFTER)
-        if evidence is not None and _surely_moving(evidence).mean() > QUICK_SHARE:
+        if evidence is not None and _surely_moving(evidence, FOR_POSES).mean() > QUICK_SHARE:
             found += 1
     return found >= QUICK_FRAMES
 
 
-def find(views: Views, progress: Callable[[range], Iterable[int]] = iter) -> np.ndarray:
+def find(views: Views, progress: Callable[[range], Iterable[int]] = iter, *, rule: Rule = FOR_POSES) -> np.ndarray:
     """Find what moves in every view, (F, v, u) bool; nothing where its pose is unknown or contradicts most of what is seen.
 
     The last views have none after them that would look through what moves: there it is followed from the view before.
@@ -82,16 +95,16 @@ def find(views: Views, progress: Callable[[range], Iterable[int]] = iter) -> np.
     moving = np.zeros((len(views.stamp), *shape(views.camera)), dtype=bool)
     for frame in progress(range(len(moving))):
         is_followed = frame > 0 and views.stamp[-1] - views.stamp[frame] < FOLLOWED
-        moving[frame] = _find_in(views, frame, moving[frame - 1] if is_followed else None)
+        moving[frame] = _find_in(views, frame, moving[frame - 1] if is_followed else None, rule)
     return moving
 
 
-def _find_in(views: Views, frame: int, before: np.ndarray | None) -> np.ndarray:
+def _find_in(views: Views, frame: int, before: np.ndarray | None, rule: Rule) -> np.ndarray:
     """Find what moves in one view, (v, u) bool; before : (v, u) what moves in the view before, if that is to be followed."""
-    evidence = weigh(views, frame, AFTER)
+    evidence = weigh(views, frame, rule.after)
     if evidence is None:
         return np.zeros(shape(views.camera), dtype=bool)
-    z, seed = evidence.depth, _surely_moving(evidence)
+    z, seed = evidence.depth, _surely_moving(evidence, rule)
     is_still = (evidence.n_still >= MIN_STILL) & (evidence.n_through == 0)
     followed = np.zeros_like(seed) if before is None else _followed(views, frame, z, before) & ~is_still
     if not (seed | followed).any():
@@ -152,10 +165,10 @@ def _others(views: Views, frame: int, after: tuple[float, ...]) -> np.ndarray:
     return others[usable]
 
 
-def _surely_moving(evidence: Evidence) -> np.ndarray:
-    """Find the places that more views look through than find again, in groups large enough not to be noise."""
-    seed = (evidence.n_through >= MIN_THROUGH) & (evidence.n_through > evidence.n_still)
-    return kernels.groups(seed, evidence.depth, GROUP_JUMP, MIN_GROUP)
+def _surely_moving(evidence: Evidence, rule: Rule) -> np.ndarray:
+    """Find the places that enough views look through, against those that find them again, in groups large enough."""
+    seed = (evidence.n_through >= rule.min_through) & (evidence.n_through > rule.weight_still * evidence.n_still)
+    return kernels.groups(seed, evidence.depth, GROUP_JUMP, rule.min_group)
 
 
 def hide_features(features: Features, moving: np.ndarray, camera: Camera) -> Features:

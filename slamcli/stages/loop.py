@@ -18,6 +18,7 @@ from slamcli.schema import LOST, Closures, Map, Moving, Timing, Tracks, Words, f
 from slamcli.slam import doubt, final_refinement, loop_closing, map_merging, map_segments, pose_doubt
 from slamcli.slam.depth_tracking import Reliefs
 from slamcli.slam.loop_closing import Candidate, Claims
+from slamcli.slam.moving_objects import FOR_MAPS
 from slamcli.slam.place_recognition import PlaceIndex
 from slamcli.sparse_map import map_adjustment
 from slamcli.sparse_map.sparse_map import MapBuilder
@@ -60,7 +61,7 @@ def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
     for segment, told in enumerate(describe_other_segments(tracks, map_), start=1):
         tools.warn(f"{told}, could not be joined: their poses, in a frame of their own, are in {segment_file(segment)}; no map shows them")
     save_map(out, features.stamp, tracks, map_)
-    moving = moving_parts.find(inputs, tracks, map_, tools) if len(moving.moving) else moving
+    moving = moving_parts.find(inputs, tracks, map_, tools, rule=FOR_MAPS) if len(moving.moving) else moving
     artifacts.save(moving, out)
     first = inputs.load(Tracks, "track"), inputs.load(Map, "track")
     doubts = pose_doubt.judge(moving_parts.views(inputs, tracks, map_), moving.moving, first, (tracks, map_))

@@ -5,7 +5,7 @@ import numpy as np
 from slamcli.geometry.camera import Camera
 from slamcli.schema import CoarseDepth, Features, Map, Moving, Tracks, frame_poses, frame_segments
 from slamcli.slam import moving_objects
-from slamcli.slam.moving_objects import Views
+from slamcli.slam.moving_objects import FOR_POSES, Rule, Views
 from slamcli.stages.contract import Inputs, Summary, Tools
 
 NOTHING = Moving()
@@ -18,9 +18,9 @@ def are_any(inputs: Inputs, tracks: Tracks, map_: Map) -> bool:
     return seen.depth.size > 0 and moving_objects.is_any(seen)
 
 
-def find(inputs: Inputs, tracks: Tracks, map_: Map, tools: Tools) -> Moving:
+def find(inputs: Inputs, tracks: Tracks, map_: Map, tools: Tools, *, rule: Rule = FOR_POSES) -> Moving:
     """Find what moves in every frame, seen from these poses."""
-    found = moving_objects.find(views(inputs, tracks, map_), lambda frames: tools.progress(frames, "moving objects"))
+    found = moving_objects.find(views(inputs, tracks, map_), lambda frames: tools.progress(frames, "moving objects"), rule=rule)
     return Moving(found) if found.any() else Moving()
 
 

@@ -35,12 +35,12 @@ def recording(who: str) -> tuple[Views, np.ndarray]:
     """Views of the room with nobody, somebody who walks, or somebody who stands in it; and the places (F, v, u) that show somebody."""
     depth, masks = [], []
     for i in range(FRAMES):
-        boxes = {"nobody": (), "walking": (walker(i),), "standing": (walker(12),)}[who]
-        T_lc = camera_at(i)
+        boxes = {"nobody": (), "walking": (walker(i),), "standing": (walker(12),), "leaving": (walker(14),) if i < 18 else ()}[who]
+        T_lc = camera_at(0 if who == "leaving" else i)
         seen, empty = render(T_lc, KINECT, boxes=(*FURNITURE, *boxes)), render(T_lc, KINECT)
         depth.append(icp.coarse(seen))
         masks.append((seen < empty - 1e-3)[STEP // 2 :: STEP, STEP // 2 :: STEP])
-    T_wc = np.array([camera_at(i) for i in range(FRAMES)])
+    T_wc = np.array([camera_at(0 if who == "leaving" else i) for i in range(FRAMES)])
     return Views(np.array(depth), np.arange(FRAMES) / RATE, T_wc, np.zeros(FRAMES, dtype=np.int64), KINECT), np.array(masks)
 
 
@@ -59,6 +59,15 @@ def test_a_walker_is_found_and_next_to_nothing_else() -> None:
 def test_what_stands_still_while_it_is_seen_is_kept(who: str) -> None:
     views, _ = recording(who)
     assert not moving_objects.is_any(views) and not moving_objects.find(views).any()
+
+
+def test_who_stood_half_the_time_is_kept_for_poses_and_not_for_maps() -> None:
+    views, truth = recording("leaving")
+    views = replace(views, stamp=6.0 * views.stamp)  # leaves after seven of fourteen seconds
+    for rule, least, most in ((moving_objects.FOR_POSES, 0.0, 0.0), (moving_objects.FOR_MAPS, 0.9, 1.0)):
+        found = moving_objects.find(views, rule=rule)
+        assert least <= (found & truth)[8:12].sum() / truth[8:12].sum() <= most
+        assert (found & ~truth).sum() / (~truth).sum() < 0.03
 
 
 def test_nothing_is_said_under_unknown_or_wholly_wrong_poses() -> None:
