@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -77,19 +78,20 @@ def export_grid(
     warn_without_floor(folder)
     warn_of_doubt(folder)
     start = _start(folder, mount)
-    written: tuple[Path, ...] = grid_map.write(out, grid_map.GridMap.of(grid), start=start)
+    page = grid_map.GridMap.of(grid)
+    written: tuple[Path, ...] = grid_map.write(out, page, start=start)
     if png is not None:
         from slamcli.visualization.grid_picture import save_picture
 
         save_picture(png, grid, trajectory=camera_path(folder), title=str(folder.info()["dataset"]))
         written = (*written, png)
-    place = {"origin": grid_map.GridMap.of(grid).origin, "resolution": grid_map.GridMap.of(grid).resolution}
+    write_costs = partial(cost_map.write, origin=page.origin, resolution=page.resolution)
     if costs is not None:
         radius = folder.config().robot.radius if radius is None else radius
-        written = (*written, *cost_map.write(costs, cost_layers.inflated(grid, radius=radius, reach=reach, falloff=falloff), **place))
+        written = (*written, *write_costs(costs, cost_layers.inflated(grid, radius=radius, reach=reach, falloff=falloff)))
     if keep_out is not None:
         is_kept_out = _kept_out(grid, keep_out)
-        written = (*written, *cost_map.write(out.with_name(f"{out.stem}_keepout.pgm"), 100 * is_kept_out.astype(np.int16), **place))
+        written = (*written, *write_costs(out.with_name(f"{out.stem}_keepout.pgm"), 100 * is_kept_out.astype(np.int16)))
     rows, columns = grid.state.shape
     if as_json:
         about = {"out": [str(path) for path in written], "columns": columns, "rows": rows, "resolution": float(grid.resolution)}

@@ -201,7 +201,6 @@ class Inputs:
             CoarseDepth: CoarseDepth(np.zeros((n, 0, 0), np.uint16)),
             Moving: Moving(),
             Ground: Ground(T_lw, plane, np.array(0.01), np.array(0.9), np.array(is_found)),
-            Moving: Moving(),
             Timing: Timing(np.array(0.0), np.array(0.0), np.array(0.0), np.zeros((n, 6))),
             Tracks: Tracks(np.where(lost, -1, np.arange(n)).astype(np.int32), T_kc, np.ones(n, np.uint8), np.full(n, 99, np.int32)),
             Map: Map(
