@@ -68,3 +68,13 @@ def test_masks_go_with_their_pictures(tmp_path: Path) -> None:
     dataset = open_dataset(str(folder))
     assert [dataset.mask(i) is not None for i in range(4)] == [False, False, True, False]
     assert np.array_equal(dataset.mask(2), mask > 0)
+
+
+def test_seven_scenes_without_intrinsics_has_depth_of_a_camera_of_its_own(tmp_path: Path) -> None:
+    for i in range(3):
+        for kind, image in (("color", np.full((480, 640, 3), 90, np.uint8)), ("depth", np.full((480, 640), 2000, np.uint16))):
+            (tmp_path / f"frame-{i:06d}.{kind}.png").write_bytes(png(image))
+    dataset = open_dataset(str(tmp_path))
+    assert (dataset.reader, dataset.camera.fx, dataset.depth_camera.fx) == ("seven_scenes", 525.0, 585.0)
+    assert np.isfinite(dataset.depth(0)).mean() > 0.75  # a Kinect's depth covers less than its colour picture
+    assert any("registered to colour on reading (focal length 585.0 px, 25 mm aside)" in warning for warning in dataset.warnings)

@@ -12,7 +12,7 @@ from slamcli.errors import SlamError
 
 DEPTH_SCALE = 1000.0  # 65535 = none
 # J. Shotton et al., CVPR 2013: both cameras uncalibrated; the data set's page names f = 585, (320, 240) for depth. Colour is the Kinect's
-# nominal, its camera 25 mm beside.
+# nominal; it looks from 25 mm to the left of the depth camera, as calibrations of that device have it.
 COLOUR = {"width": 640, "height": 480, "fx": 525.0, "fy": 525.0, "cx": 320.0, "cy": 240.0}
 DEPTH = {"width": 640, "height": 480, "fx": 585.0, "fy": 585.0, "cx": 320.0, "cy": 240.0}
 BASELINE = 0.025  # [m]
@@ -35,7 +35,7 @@ def read(path: Path) -> Recorded:
         calibration = find_calibration(path.parent)
     if not calibration.values:
         T_cd = np.eye(4)
-        T_cd[0, 3] = -BASELINE
+        T_cd[0, 3] = BASELINE
         calibration = Calibration(dict(COLOUR), "nominal calibration of 7-Scenes", dict(DEPTH), T_cd)
     poses = numbered(folder, "", (".txt",), ending=".pose")
     return Recorded(
