@@ -15,7 +15,7 @@ ALL_SLICES = (1 << SLICES) - 1
 NOT_SEEN, PASSED, SEEN = 0, 1, 2  # of a cell's floor: PASSED is a line of sight below the band, which ends on the floor farther on
 HOLE_POINTS = 2  # readings through the floor's plane that make a cell a hole: one may be a slip
 ROWS = 120  # of an image: a surface is level by a pixel this share above; a nearer one would show the noise instead of the slope
-OPEN_STRIDE = 2  # open lines of sight are followed at every so many of the pixels whose points are sorted
+OPEN_STRIDE = 3  # open lines of sight are followed at every so many of the pixels whose points are sorted
 TOP_REACH = 0.3  # [m] above the band: what is seen there from above may be the top of something that reaches into the band
 
 
