@@ -276,19 +276,24 @@ def digest(value: Any) -> str:
 
 def write_sealed(path: Path, value: Mapping[str, Any]) -> None:
     """Write a JSON object together with its digest, so that `read_sealed` notices any change."""
-    write_text(path, _sealed(value))
+    write_text(path, sealed(value))
 
 
 def read_sealed(path: Path) -> dict[str, Any]:
     """Read what `write_sealed` wrote; SlamError when it is not there or a single bit of it is another."""
-    text = _read_json_text(path)
-    value = _parse_json(path, text)
+    return unsealed(_read_json_text(path), source=path)
+
+
+def unsealed(text: str, *, source: Path) -> dict[str, Any]:
+    """Take the JSON object out of what `sealed` gave; SlamError names `source` when a single bit of it is another."""
+    value = _parse_json(source, text)
     value.pop(SEAL, None)
-    if _sealed(value) != text:
-        raise SlamError(f"{path}: not as slamcli wrote it")
+    if sealed(value) != text:
+        raise SlamError(f"{source}: not as slamcli wrote it")
     return value
 
 
-def _sealed(value: Mapping[str, Any]) -> str:
+def sealed(value: Mapping[str, Any]) -> str:
+    """Write a JSON object as text that holds its own digest."""
     plain = json.loads(json.dumps(value))
     return json.dumps({**plain, SEAL: digest(plain)}, indent=1) + "\n"

@@ -4,7 +4,6 @@ A worker has them in a folder of its own while it works on them. A stored stage 
 is written last, and whoever reads the stage compares every file with the digest recorded there.
 """
 
-import json
 import os
 import shutil
 from contextlib import suppress
@@ -110,12 +109,14 @@ class StoredRun:
         What is here already stays, and so does what cannot be read whole: the pipeline then makes it anew.
         """
         if not (self.path / "run.json").exists():
-            if (info := self._text("run.json")) is None:
+            try:
+                info = _with_root(self._text("run.json") or "", root)
+            except SlamError:  # absent or damaged
                 return
             self.path.mkdir(parents=True, exist_ok=True)
             if (config := self._text("config.toml")) is not None:
                 files.write_text(self.path / "config.toml", config)
-            files.write_text(self.path / "run.json", _with_root(info, root))
+            files.write_text(self.path / "run.json", info)
         run = RunDir(self.path)
         with run.lock():
             for stage in NAMES[: NAMES.index(until) + 1]:
@@ -162,16 +163,16 @@ class StoredRun:
 
 
 def _with_root(text: str, root: str) -> str:
-    return json.dumps({**json.loads(text), "root": root}, indent=1) + "\n"
+    return files.sealed({**files.unsealed(text, source=Path("run.json")), "root": root})
 
 
 def _record(text: str) -> dict[str, Any] | None:
-    """Parse a stored stage's record; None for anything but a record whose files lie in the stage's folder."""
+    """Parse a stored stage's record; None for anything but an intact record whose files lie in the stage's folder."""
     try:
-        record = json.loads(text) if len(text) <= LARGEST_TEXT else None
-    except (ValueError, RecursionError):
+        record = files.unsealed(text, source=Path("stage.json"))
+    except SlamError:
         return None
-    if not isinstance(record, dict) or not isinstance(record.get("outputs"), dict):
+    if not isinstance(record.get("outputs"), dict):
         return None
     paths = [PurePosixPath(name) for name in record["outputs"]]
     return record if not any(path.is_absolute() or ".." in path.parts for path in paths) else None

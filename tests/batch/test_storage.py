@@ -8,6 +8,7 @@ import pytest
 
 pytest.importorskip("fsspec", reason="runs elsewhere need fsspec")
 
+from slamcli import files
 from slamcli.batch import storage
 from slamcli.batch.storage import StoredRun
 from slamcli.errors import SlamError
@@ -65,8 +66,8 @@ def test_a_changed_stage_replaces_the_stored_one_and_an_equal_one_is_not_sent_ag
     before = (folder_of(stored) / "loop" / "stage.json").stat().st_mtime_ns
     StoredRun(stored, copy).push("loop", "/data/room")
     assert (folder_of(stored) / "loop" / "stage.json").stat().st_mtime_ns == before
-    record = json.loads((copy / "loop" / "stage.json").read_text())
-    (copy / "loop" / "stage.json").write_text(json.dumps({**record, "seconds": 99.0}))
+    record = files.read_sealed(copy / "loop" / "stage.json")
+    files.write_sealed(copy / "loop" / "stage.json", {**record, "seconds": 99.0})
     StoredRun(stored, copy).push("loop", "/data/room")
     assert json.loads((folder_of(stored) / "loop" / "stage.json").read_text())["seconds"] == 99.0
 
@@ -74,11 +75,17 @@ def test_a_changed_stage_replaces_the_stored_one_and_an_equal_one_is_not_sent_ag
 @pytest.mark.parametrize("name", ["../../outside.txt", "/etc/slamcli-outside", "a/../../../b"])
 def test_a_stored_record_whose_files_lie_elsewhere_is_not_followed(stored: str, tmp_path: Path, name: str) -> None:
     path = folder_of(stored) / "match" / "stage.json"
-    record = json.loads(path.read_text())
-    path.write_text(json.dumps({**record, "outputs": {name: {"bytes": 1, "sha256": ""}}}))
+    files.write_sealed(path, {**files.read_sealed(path), "outputs": {name: {"bytes": 1, "sha256": ""}}})
     StoredRun(stored, tmp_path / "deep" / "copy").pull("/data/room")
     assert not (tmp_path / "deep" / "copy" / "match").exists()
     assert not list(tmp_path.glob("**/outside.txt"))
+
+
+def test_a_damaged_run_json_makes_the_run_absent(stored: str, tmp_path: Path) -> None:
+    path = folder_of(stored) / "run.json"
+    path.write_text(path.read_text().replace("bucket", "basket"))
+    StoredRun(stored, tmp_path / "copy").pull("/data/room")
+    assert not (tmp_path / "copy").exists()
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{", '{"outputs": 3}', "[" * 100000])
