@@ -7,12 +7,12 @@ from pathlib import Path
 
 import click
 
-from slamcli.cli.common import check_ending, json_option
+from slamcli.cli.common import Target, check_ending, json_option
 
 
 @click.command("compare", short_help="Put several runs side by side.")
 @click.argument("runs", nargs=-1, required=True, metavar="RUN RUN...")
-@click.option("-o", "--out", type=click.Path(path_type=Path, dir_okay=False), help="Also write the table as one HTML page.")
+@click.option("-o", "--out", type=Target(), help="Also write the table as one HTML page.")
 @json_option
 def compare_command(runs: tuple[str, ...], out: Path | None, as_json: bool) -> None:
     """Put runs side by side: settings that differ, time, error, frames located, what speaks against each map, and how the maps differ.

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from slamcli.cli.common import check_ending, json_option, run_option
+from slamcli.cli.common import Target, check_ending, json_option, run_option
 
 if TYPE_CHECKING:
     from slamcli.runs.housekeeping import Listed
@@ -68,7 +68,7 @@ def clean_command(run: str | None, keep: str, as_json: bool) -> None:
 
 
 @click.command("archive", short_help="Pack a run into one zip file.")
-@click.argument("out", type=click.Path(path_type=Path, dir_okay=False))
+@click.argument("out", type=Target())
 @run_option
 @click.option("--results", is_flag=True, help="Leave out what only stages read.")
 @json_option

@@ -1,6 +1,5 @@
 """Run directories as things on a disk: which there are, what may be cleared away, and one file to take along."""
 
-import os
 import shutil
 import zipfile
 from collections.abc import Iterator, Sequence
@@ -8,6 +7,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from slamcli import files
 from slamcli.errors import SlamError
 from slamcli.runs.run_directory import LATEST, RUNS, RunDir
 from slamcli.stages import NAMES
@@ -109,18 +109,11 @@ def archive(run: RunDir, out: Path, *, skip: Sequence[str] = ()) -> int:
     if out.resolve().is_relative_to(run.path.resolve()):
         raise SlamError(f"{out}: lies in the run that is to be packed; choose another place")
     chosen = [path for path in files_of(run) if path.relative_to(run.path).parts[0] not in skip]
-    fresh = out.with_name(f".{out.name}.{os.getpid()}")
-    try:
-        with zipfile.ZipFile(fresh, "w", compression=zipfile.ZIP_DEFLATED) as packed:
-            for path in chosen:
-                entry = zipfile.ZipInfo(f"{run.path.resolve().name}/{path.relative_to(run.path).as_posix()}", date_time=EARLIEST)
-                entry.compress_type = zipfile.ZIP_DEFLATED
-                entry.external_attr = 0o644 << 16
-                with path.open("rb") as source, packed.open(entry, "w", force_zip64=True) as target:
-                    shutil.copyfileobj(source, target, 1 << 20)
-        os.replace(fresh, out)
-    except OSError as error:
-        raise SlamError(f"{out}: cannot be written ({error.strerror}); choose another place") from error
-    finally:
-        fresh.unlink(missing_ok=True)
+    with files.whole(out) as file, zipfile.ZipFile(file, "w", compression=zipfile.ZIP_DEFLATED) as packed:
+        for path in chosen:
+            entry = zipfile.ZipInfo(f"{run.path.resolve().name}/{path.relative_to(run.path).as_posix()}", date_time=EARLIEST)
+            entry.compress_type = zipfile.ZIP_DEFLATED
+            entry.external_attr = 0o644 << 16
+            with path.open("rb") as source, packed.open(entry, "w", force_zip64=True) as target:
+                shutil.copyfileobj(source, target, 1 << 20)
     return len(chosen)
