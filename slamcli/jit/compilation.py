@@ -48,7 +48,7 @@ def ensure(*, progress: Progress = silent, tell: Tell = log.info) -> None:
     done = cache.folder() / f"compiled-{_digest()}"
     if done.exists():
         return
-    with _alone(done.parent):
+    with _alone(done):
         if done.exists():
             return
         start, n = time.perf_counter(), 0
@@ -65,12 +65,12 @@ def ensure(*, progress: Progress = silent, tell: Tell = log.info) -> None:
 
 
 @contextlib.contextmanager
-def _alone(folder: Path) -> Iterator[None]:
-    """Let one program at a time compile into a folder: the others would only do the same work beside it."""
+def _alone(done: Path) -> Iterator[None]:
+    """Let one program at a time compile what `done` stands for: the others would only do the same work beside it."""
     with contextlib.ExitStack() as stack:
         with contextlib.suppress(OSError):  # a file system without locks, or a full one: then side by side
-            folder.mkdir(parents=True, exist_ok=True)
-            fcntl.flock(stack.enter_context(open(folder / ".lock", "a")), fcntl.LOCK_EX)
+            done.parent.mkdir(parents=True, exist_ok=True)
+            fcntl.flock(stack.enter_context(open(done.with_name(f".{done.name}.lock"), "a")), fcntl.LOCK_EX)
         yield
 
 
