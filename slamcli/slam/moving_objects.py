@@ -31,6 +31,7 @@ GROWTH_MOST = 12  # places from one surely moving: more, and what is seen once o
 FOLLOWED = 0.8  # [s] before the end of the recording
 ENCLOSED = 4  # of its eight neighbours move: so does a place without depth
 MOST = 0.6  # of the surface seen [m^2]: when more seems to move, it is the pose that is wrong
+MAP_MARGIN = 2  # places around what moves that maps leave out: other views show what stands there
 QUICK_EVERY, QUICK_AFTER = 4, (0.35, 0.8)  # frames looked at first, and [s] as AFTER, to see whether anything moves at all
 QUICK_SHARE, QUICK_FRAMES = 0.02, 2  # a recording has moving objects when this share of a view moves in so many of these frames
 OUT_OF_SIGHT = -1e4  # [px] where no search looks
@@ -202,12 +203,15 @@ def hide_coarse(depth: CoarseDepth, moving: np.ndarray, camera: Camera) -> Coars
 
 def hide_pixels(depth: np.ndarray, mask: np.ndarray, camera: Camera) -> np.ndarray:
     """Remove what moves from a depth image (H, W) [m]; mask : (v, u) bool."""
-    return np.where(np.append(with_margin(mask).ravel(), False)[_lookup(camera, _side(camera), mask.shape)], np.float32(np.nan), depth)
+    return np.where(
+        np.append(with_margin(mask, MAP_MARGIN).ravel(), False)[_lookup(camera, _side(camera), mask.shape)], np.float32(np.nan), depth
+    )
 
 
-def with_margin(mask: np.ndarray) -> np.ndarray:
-    """Widen a mask (v, u) by one place: outlines of what moves are found least surely, and features sit on outlines."""
-    return cv2.dilate(mask.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
+def with_margin(mask: np.ndarray, places: int = 1) -> np.ndarray:
+    """Widen a mask (v, u) on all sides: outlines of what moves are found least surely, and features sit on outlines."""
+    side = 2 * places + 1
+    return cv2.dilate(mask.astype(np.uint8), np.ones((side, side), np.uint8)).astype(bool)
 
 
 def _side(camera: Camera) -> int:
