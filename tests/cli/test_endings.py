@@ -39,13 +39,14 @@ def start(code: str, *, arguments: tuple[str, ...] = ("run", "-r", "run"), **opt
 
 
 def listening() -> None:
-    """What is started in the background ignores Ctrl-C; a program at a terminal does not."""
+    """What is started in the background ignores Ctrl-C or a hang-up; a program at a terminal does not."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 
 @pytest.mark.parametrize(
     ("number", "status", "word"),
-    [(signal.SIGINT, 130, "interrupted"), (signal.SIGTERM, 143, "terminated"), (signal.SIGHUP, 143 - 14, "terminated")],
+    [(signal.SIGINT, 130, "interrupted"), (signal.SIGTERM, 143, "terminated"), (signal.SIGHUP, 129, "terminated")],
 )
 def test_a_signal_ends_a_stage_with_a_word_and_leaves_nothing_half(place: Path, number: int, status: int, word: str) -> None:
     wait = "sys.modules['slamcli.stages.track'] = fakes.module(STAGES[2], lambda out: (print('in', flush=True), time.sleep(60)))\n"

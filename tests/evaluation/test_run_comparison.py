@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from slamcli.config import toml
 from slamcli.evaluation import run_comparison
 from slamcli.runs.run_directory import RunDir
 from slamcli.schema import Grid
@@ -64,7 +65,8 @@ def pair(tmp_path_factory: pytest.TempPathFactory) -> tuple:
 def test_compare_on_the_command_line(slamcli, pair, tmp_path) -> None:
     run, other = pair
     shutil.copytree(run, tmp_path / "same")
-    (tmp_path / "same" / "config.toml").write_text("[track]\nmin_inliers = 20\n")
+    same = RunDir.find(str(tmp_path / "same"))
+    same.write_config(toml.apply(same.config(), ["track.min_inliers=20"]))
     compared = json.loads(slamcli("compare", run, tmp_path / "same", other, "--json").stdout)
     assert [one["located"] for one in compared] == [37, 37, 35]
     assert compared[1]["settings"] == {"track.min_inliers": 20}

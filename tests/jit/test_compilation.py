@@ -102,7 +102,8 @@ def test_a_process_compiles_its_share_and_names_it() -> None:
     command = [sys.executable, "-c", compilation.CHILD, "0", str(len(compilation.declared()))]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120, cwd=home)
     assert done.returncode == 0, done.stderr
-    assert done.stdout.split() == [compilation.declared()[0].py_func.__qualname__]
+    (name,) = done.stdout.split()
+    assert name in {kernel.py_func.__qualname__ for kernel in compilation.declared()}
 
 
 def test_a_full_folder_is_told_and_not_taken_for_a_finished_one(

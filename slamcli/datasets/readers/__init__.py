@@ -5,29 +5,10 @@ and calibration; everything after that is the same for all and is done in `slamc
 """
 
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, cast
 
-from slamcli.datasets.readers import (
-    associations,
-    azure_mkv,
-    icl_nuim,
-    numbered,
-    open3d,
-    r3d,
-    realsense,
-    record3d,
-    replica,
-    rosbag,
-    rtabmap,
-    rtabmap_db,
-    scannet,
-    sens,
-    seven_scenes,
-    strayscanner,
-    transforms,
-    tum,
-)
 from slamcli.datasets.recorded import Recorded
 
 
@@ -45,37 +26,37 @@ class Layout(Protocol):
 class Reader:
     """One layout."""
 
-    layout: Layout  # its module
+    name: str  # of its module here
     title: str
     told_by: str
     extra: str = ""  # what of slamcli[...] it needs beside a plain install
 
     @property
-    def name(self) -> str:
-        """Name the layout as its module is named."""
-        return self.layout.__name__.rsplit(".", 1)[-1]  # type: ignore[attr-defined]
+    def layout(self) -> Layout:
+        """Import its module, which happens when a path is looked at: a run's results depend on its own reader alone."""
+        return cast(Layout, import_module(f"slamcli.datasets.readers.{self.name}"))
 
 
 # The more telling first: a recording is read by the first that recognises it.
 READERS = (
-    Reader(r3d, "Record3D's own file", "suffix .r3d", "phone"),
-    Reader(sens, "ScanNet's .sens", "suffix .sens"),
-    Reader(rtabmap_db, "RTAB-Map's database", "suffix .db, SQLite"),
-    Reader(realsense, "librealsense's recorder", ".bag or .db3 with topics /device_0/sensor_*"),
-    Reader(rosbag, "ROS 1 bag, ROS 2 bag, MCAP", ".bag, .mcap, .db3, or a folder with metadata.yaml"),
-    Reader(azure_mkv, "Azure Kinect's recorder", "suffix .mkv", "video"),
-    Reader(tum, "TUM RGB-D, ETH3D-SLAM, Bonn", "rgb.txt and depth.txt"),
-    Reader(record3d, "Record3D's export", "metadata.json, rgb/ and depth/", "phone"),
-    Reader(strayscanner, "StrayScanner", "odometry.csv, rgb.mp4 and depth/", "video"),
-    Reader(transforms, "nerfstudio, Polycam, NeRFCapture", "transforms.json with depth"),
-    Reader(open3d, "Open3D's recorder", "camera_intrinsic.json, color/ and depth/"),
-    Reader(scannet, "ScanNet, extracted", "intrinsic/intrinsic_color.txt, color/ and depth/"),
-    Reader(replica, "Replica as NICE-SLAM has it", "results/frame*.jpg and results/depth*.png"),
-    Reader(seven_scenes, "7-Scenes, tsdf-fusion", "frame-*.color.png or .jpg, frame-*.depth.png"),
-    Reader(icl_nuim, "ICL-NUIM", "*.gt.freiburg beside lists or folders of images"),
-    Reader(rtabmap, "RTAB-Map's export", "calib/, rgb/ and depth/"),
-    Reader(associations, "pairs in one list", "associations.txt, associate.txt, assoc.txt ..."),
-    Reader(numbered, "numbered images", "rgb/, color/ or image/ and depth/ with equal numbers or stamps for names"),
+    Reader("r3d", "Record3D's own file", "suffix .r3d", "phone"),
+    Reader("sens", "ScanNet's .sens", "suffix .sens"),
+    Reader("rtabmap_db", "RTAB-Map's database", "suffix .db, SQLite"),
+    Reader("realsense", "librealsense's recorder", ".bag or .db3 with topics /device_0/sensor_*"),
+    Reader("rosbag", "ROS 1 bag, ROS 2 bag, MCAP", ".bag, .mcap, .db3, or a folder with metadata.yaml"),
+    Reader("azure_mkv", "Azure Kinect's recorder", "suffix .mkv", "video"),
+    Reader("tum", "TUM RGB-D, ETH3D-SLAM, Bonn", "rgb.txt and depth.txt"),
+    Reader("record3d", "Record3D's export", "metadata.json, rgb/ and depth/", "phone"),
+    Reader("strayscanner", "StrayScanner", "odometry.csv, rgb.mp4 and depth/", "video"),
+    Reader("transforms", "nerfstudio, Polycam, NeRFCapture", "transforms.json with depth"),
+    Reader("open3d", "Open3D's recorder", "camera_intrinsic.json, color/ and depth/"),
+    Reader("scannet", "ScanNet, extracted", "intrinsic/intrinsic_color.txt, color/ and depth/"),
+    Reader("replica", "Replica as NICE-SLAM has it", "results/frame*.jpg and results/depth*.png"),
+    Reader("seven_scenes", "7-Scenes, tsdf-fusion", "frame-*.color.png or .jpg, frame-*.depth.png"),
+    Reader("icl_nuim", "ICL-NUIM", "*.gt.freiburg beside lists or folders of images"),
+    Reader("rtabmap", "RTAB-Map's export", "calib/, rgb/ and depth/"),
+    Reader("associations", "pairs in one list", "associations.txt, associate.txt, assoc.txt ..."),
+    Reader("numbered", "numbered images", "rgb/, color/ or image/ and depth/ with equal numbers or stamps for names"),
 )
 
 
