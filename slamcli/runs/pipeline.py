@@ -195,13 +195,15 @@ class Pipeline:
     def run_alone(self, name: str) -> None:
         """Run one stage, even when it is up to date, from whatever its predecessors left."""
         stage, states = stage_named(name), self.states()
-        for need in (states[n] for n in reversed(stage.needs) if n != "dataset"):  # the latest first: its advice brings the others too
+        needs = [states[n] for n in stage.needs if n != "dataset"]
+        for need in reversed(needs):  # the latest first: its advice brings the others too
             if need.state == staleness.MISSING:
                 raise SlamError(f"{name} needs {need.stage}, which has not been run; try: slamcli run --until {need.stage} {self.run.flag}")
             if need.state == staleness.DAMAGED:
                 raise SlamError(
                     f"{name} needs {need.stage}, which is damaged ({need.reason}); try: slamcli run --until {need.stage} {self.run.flag}"
                 )
+        for need in needs:
             if not need.is_fresh:
                 log.warning(
                     "%s rests on %s, which is stale (%s); bring it up to date with: slamcli run %s",
