@@ -34,9 +34,9 @@ LEVERS = {  # how each is turned, and what it is
     "optimize.move_depth=false": "depth moved to the colour image's time",
     "optimize.depth_delay=false": "of that, the delay that the stamps do not show",
     "optimize.readout=false": "rolling shutter",
-    "optimize.shape_edges=0": "depth images of key frames aligned with each other",
+    "optimize.depth_icp_edges=0": "depth images of key frames aligned with each other",
     "loop.enabled=false": "loop closing",
-    "loop.hindsight=false": "second look at every frame after loops are closed",
+    "loop.final_refinement=false": "second look at every frame after loops are closed",
     "optimize.intrinsics=true": "intrinsics found as well, where the calibration is good",
     "optimize.depth_scale=true": "scale and offset of depth found as well",
 }
@@ -83,7 +83,7 @@ def measured(recording: str, offset: int, seed: int, levers: list[str], out: Pat
 
 
 def figures(run: RunDir) -> dict[str, float]:
-    """Give APE after loop [m] and the share of frames with a pose."""
+    """Return APE after loop [m] and the share of frames with a pose."""
     result = accuracy.ours(run)
     return {"ape": result.ape["loop"], "coverage": result.coverage}
 

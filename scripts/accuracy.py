@@ -124,7 +124,7 @@ def to_run(run: RunDir, before: Config, after: Config) -> tuple[str, ...]:
 
 
 def ours(run: RunDir) -> Result:
-    """Give the error after each stage of a run."""
+    """Return the error after each stage of a run."""
     told = {stage: rivals.accuracy(run, trajectory_error.stage_trajectory(run, stage)) for stage in STAGES}
     errors = {stage: float("nan") if f["ape"] is None else f["ape"] for stage, f in told.items()}
     cpu = sum(run.record(stage)["cpu_seconds"] - run.record(stage)["compile_seconds"] for stage in STAGES)

@@ -144,7 +144,7 @@ def recording(folder: Path, seed: int, frames: int) -> Path:
 
 
 def start_batch(cluster: Cluster, recordings: list[Path], out: Path) -> subprocess.Popen:
-    """Give the command."""
+    """Return the command."""
     command = [sys.executable, "-m", "slamcli", "batch", *map(str, recordings), "--out", str(out), "--cluster", cluster.address]
     with open(out.parent / "batch.log", "a") as log:
         return subprocess.Popen(command, stdout=log, stderr=log)
@@ -190,7 +190,7 @@ def stage_lines(log: Path) -> int:
 
 
 def digests(run: RunDir) -> dict[str, str]:
-    """Give each stage's digest."""
+    """Return each stage's digest."""
     return {name: record["digest"] for name in NAMES if (record := run.record(name)) is not None}
 
 

@@ -59,7 +59,7 @@ def show(run: RunDir) -> None:
 
 
 def measured(run: RunDir) -> list[dict[str, Any]]:
-    """Give the record of each stage that has been run, in order."""
+    """Return the record of each stage that has been run, in order."""
     records = [record for name in NAMES if (record := run.record(name)) is not None]
     if not records or records[0]["stage"] != "extract":
         raise SlamError(f"{run.path}: extract has not been run, so there is nothing to show")
@@ -85,7 +85,7 @@ def row(name: str, records: list[dict[str, Any]], n_frames: int) -> list[str]:
 
 
 def cpu_ms(records: list[dict[str, Any]], n_frames: int) -> float:
-    """Give the CPU time of stages without compilation [ms a frame]."""
+    """Return the CPU time of stages without compilation [ms a frame]."""
     return 1e3 * sum(record["cpu_seconds"] - record["compile_seconds"] for record in records) / n_frames
 
 
@@ -135,7 +135,7 @@ MAP_FILES = {
 
 
 def ours(run: RunDir) -> dict[str, Any]:
-    """Give the figures of our own run, from its records."""
+    """Return the figures of our own run, from its records."""
     records = measured(run)
     n_frames = records[0]["summary"]["frames"]
     figures = {
@@ -148,7 +148,7 @@ def ours(run: RunDir) -> dict[str, Any]:
 
 
 def plain_orb_ms(run: RunDir) -> float:
-    """Give the CPU time of OpenCV's ORB on images of the recording [ms], one thread, the least of three rounds."""
+    """Return the CPU time of OpenCV's ORB on images of the recording [ms], one thread, the least of three rounds."""
     dataset = run.dataset()
     images = [dataset.grey(i) for i in range(0, len(dataset), -(-len(dataset) // YARDSTICK_FRAMES))]
     orb, rounds = cv2.ORB_create(1000), []

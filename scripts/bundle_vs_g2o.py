@@ -3,7 +3,7 @@
 
     python scripts/bundle_vs_g2o.py [--seed N] [--small]
 
-Both start from the same poses and landmarks and minimise the same sum of Huber costs over pixels and depths. Times are CPU time of one
+Both start from the same poses and landmarks and minimize the same sum of Huber costs over pixels and depths. Times are CPU time of one
 thread; g2o's are of its own `optimize`, without the time to build the graph; ours are given without and with building the problem.
 """
 
@@ -50,7 +50,7 @@ def drive(n_kf: int, n_lm: int, seed: int) -> tuple:
 
 
 def cpu_ms(function) -> float:
-    """Give the CPU time [ms] of a call."""
+    """Return the CPU time [ms] of a call."""
     start = time.process_time()
     function()
     return 1e3 * (time.process_time() - start)
@@ -78,7 +78,7 @@ def compare(n_kf: int, n_lm: int, seed: int, *, repeats: int, iterations: int = 
             start = peer.cost()
             g2o_ms = min(g2o_ms, cpu_ms(lambda peer=peer: peer.optimize(iterations)) / iterations)
             after = peer.cost()
-            loop_ms = min(loop_ms, cpu_ms(lambda: bundle_adjustment._minimise(prepared, prepared.T, prepared.x, LIMITS, iterations, 0.0)))
+            loop_ms = min(loop_ms, cpu_ms(lambda: bundle_adjustment._minimize(prepared, prepared.T, prepared.x, LIMITS, iterations, 0.0)))
             built_ms = min(built_ms, cpu_ms(lambda: bundle_adjustment.Problem(*problem, is_fixed)))
             total_ms = min(total_ms, cpu_ms(lambda: bundle_adjustment.adjust(*problem, max_iterations=iterations, **adjust)))
         for _ in range(60):

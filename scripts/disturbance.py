@@ -1,9 +1,9 @@
 #!/usr/bin/env python
-"""What a covered lens and a gap do to a run, and how well one half of a recording is localised in a run of the other.
+"""What a covered lens and a gap do to a run, and how well one half of a recording is localized in a run of the other.
 
     python scripts/disturbance.py RECORDING OUT [--frames 30] [--seconds 3]
 
-Frames in the middle of the recording are blacked out, or seconds cut out; its second half is localised in a run of its first.
+Frames in the middle of the recording are blacked out, or seconds cut out; its second half is localized in a run of its first.
 RECORDING needs a ground truth. Coverage is of the frames that are not black, the last column APE as a multiple of the undisturbed
 run's over the same frames. OUT keeps the recordings (lists, with links to the images) and the runs, which are used again.
 """
@@ -21,7 +21,7 @@ from slamcli.console import table
 from slamcli.datasets import open_dataset
 from slamcli.errors import SlamError
 from slamcli.evaluation import trajectory_error
-from slamcli.runs.localization import localise
+from slamcli.runs.localization import localize
 from slamcli.runs.run_directory import RunDir
 from slamcli.schema import Trajectory
 
@@ -61,12 +61,12 @@ def disturbed(lists: rewritten.Listed, reference: Trajectory, out: Path, frames:
 
 
 def half_in_half(lists: rewritten.Listed, reference: Trajectory, out: Path) -> list[str]:
-    """Localise the second half of the recording in a run of the first."""
+    """Localize the second half of the recording in a run of the first."""
     middle = 0.5 * (lists.colour[-1][0] - lists.start)
     run = run_of(rewritten.write(out / "first_half", rewritten.between(lists, 0.0, middle)), out)
     second = rewritten.between(lists, middle, np.inf)
     recording = rewritten.write(out / "second_half", second)
-    found = localise(run, open_dataset(str(recording)), progress=console.progress)
+    found = localize(run, open_dataset(str(recording)), progress=console.progress)
     return row("second half in first", second, 0, 1, found.trajectory, reference)
 
 
@@ -88,7 +88,7 @@ def row(name: str, lists: rewritten.Listed, n_black: int, n_segments: int, found
 
 
 def error(found: Trajectory, truth: Trajectory | None, n_frames: int) -> float:
-    """Give the RMSE of the absolute pose error [m]."""
+    """Return the RMSE of the absolute pose error [m]."""
     if truth is None:
         raise SlamError("the recording has no ground truth to compare with")
     return trajectory_error.statistics(trajectory_error.ape(found, truth, n_frames=n_frames, name="trajectory").error)["rmse"]

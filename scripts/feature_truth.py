@@ -44,7 +44,7 @@ def pairs_within(a: np.ndarray, b: np.ndarray, radius: float, octave_a: np.ndarr
 
 
 def pixel_grid(camera: Camera, spacing: int) -> np.ndarray:
-    """Give pixels (N, 2) all over the image, this many apart."""
+    """Return pixels (N, 2) all over the image, this many apart."""
     columns, rows = np.meshgrid(np.arange(spacing // 2, camera.width, spacing), np.arange(spacing // 2, camera.height, spacing))
     return np.stack([columns.ravel(), rows.ravel()], axis=1).astype(np.float64)
 
@@ -71,14 +71,14 @@ class Recording:
         self._motion = lru_cache(maxsize=None)(self.motion)
 
     def pairs(self, *, apart: int, wanted: int) -> list[tuple[int, int]]:
-        """Give up to `wanted` pairs of frames (i, i + apart), spread over the recording."""
+        """Return up to `wanted` pairs of frames (i, i + apart), spread over the recording."""
         first = np.arange(len(self.dataset) - apart)
         first = first[self.is_usable[first] & self.is_usable[first + apart]]
         chosen = first[np.linspace(0, len(first) - 1, min(wanted, len(first))).astype(int)]
         return [(int(i), int(i) + apart) for i in chosen]
 
     def motion(self, i: int, j: int) -> np.ndarray:
-        """Give the pose (4, 4) of camera i in camera j: of all motions near the true trajectory's that which the images show."""
+        """Return the pose (4, 4) of camera i in camera j: of all motions near the true trajectory's that which the images show."""
         T_ji = se3.inverse(self.T_wc[j]) @ self.T_wc[i]
         raw = pixel_grid(self.camera, FOLLOWED)
         raw = raw[np.isfinite(self.seen_from(raw, i, j, T_ji)[:, 0])]
@@ -106,12 +106,12 @@ class Recording:
         return T_ji
 
     def lift(self, raw: np.ndarray, i: int) -> np.ndarray:
-        """Give the points (N, 3) that raw pixels (N, 2) of frame i show, in its camera; NaN where there is no depth."""
+        """Return the points (N, 3) that raw pixels (N, 2) of frame i show, in its camera; NaN where there is no depth."""
         column, row = np.rint(raw).astype(int).T
         return self.camera.backproject(self.camera.undistort(raw), self.depth(i)[row, column])
 
     def carry(self, raw: np.ndarray, i: int, j: int) -> np.ndarray:
-        """Give where raw pixels (N, 2) of frame i appear in frame j, undistorted (N, 2) [px]; NaN: no depth, out of view, or hidden."""
+        """Return where raw pixels (N, 2) of frame i appear in frame j, undistorted (N, 2) [px]; NaN: no depth, out of view, or hidden."""
         return self.seen_from(raw, i, j, self._motion(i, j) if i < j else se3.inverse(self._motion(j, i)))
 
     def seen_from(self, raw: np.ndarray, i: int, j: int, T_ji: np.ndarray) -> np.ndarray:
@@ -127,7 +127,7 @@ class Recording:
         return seen
 
     def shared_view(self, i: int, j: int) -> float:
-        """Give the share of frame i's pixels with depth that frame j sees too."""
+        """Return the share of frame i's pixels with depth that frame j sees too."""
         raw = pixel_grid(self.camera, GRID)
         raw = raw[np.isfinite(self.lift(raw, i)[:, 2])]
         if len(raw) == 0:

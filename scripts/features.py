@@ -43,7 +43,7 @@ Detector = Callable[[np.ndarray], orb.KeyPoints]
 
 
 def cpu_ms(works: dict[str, Callable[[], object]], n: int) -> dict[str, float]:
-    """Give the CPU time of each work on n items, of all threads, per item [ms]. They take turns, so that all meet the same machine."""
+    """Return the CPU time of each work on n items, of all threads, per item [ms]. They take turns, so that all meet the same machine."""
     best = dict.fromkeys(works, np.inf)
     for _ in range(ROUNDS):
         for name, work in works.items():
@@ -54,7 +54,7 @@ def cpu_ms(works: dict[str, Callable[[], object]], n: int) -> dict[str, float]:
 
 
 def rate(detect: Detector, images: list[np.ndarray], workers: int) -> float:
-    """Give images per second of wall time."""
+    """Return images per second of wall time."""
     start = time.perf_counter()
     for _ in ordered_map(detect, images, workers=workers):
         pass
@@ -62,7 +62,7 @@ def rate(detect: Detector, images: list[np.ndarray], workers: int) -> float:
 
 
 def threads(detect: Detector, images: list[np.ndarray]) -> dict[str, float]:
-    """Give the images per second of one worker and of two, and of a worker in each of two processes; the best of rounds taken in turn."""
+    """Return the images per second of one worker and of two, and of a worker in each of two processes; the best of rounds taken in turn."""
     one, two, apart = 0.0, 0.0, 0.0
     with ProcessPoolExecutor(2, mp_context=get_context("fork")) as pool:
         for _ in range(WALL_ROUNDS):
@@ -161,10 +161,10 @@ class ByNode:
         self.words, self.settings, self._nodes = words, settings, {}
 
     def nodes(self, points: orb.KeyPoints) -> np.ndarray:
-        """Give the nodes of a frame's points."""
+        """Return the nodes of a frame's points."""
         if id(points) not in self._nodes:
             level, margin = self.settings.node_level, self.settings.node_margin
-            self._nodes[id(points)] = points, vocabulary.quantise(self.words, points.desc, node_level=level, margin=margin)[1]
+            self._nodes[id(points)] = points, vocabulary.quantize(self.words, points.desc, node_level=level, margin=margin)[1]
         return self._nodes[id(points)][1]
 
     def __call__(self, a: orb.KeyPoints, b: orb.KeyPoints) -> tuple[np.ndarray, np.ndarray]:
@@ -173,13 +173,13 @@ class ByNode:
 
 
 def recall(recording: Recording, detect: Detector, words: vocabulary.Vocabulary) -> dict[str, float]:
-    """Tell how well places seen again are recognised: queries are the key frames that truly come back to an earlier one.
+    """Tell how well places seen again are recognized: queries are the key frames that truly come back to an earlier one.
 
     Candidates are all key frames more than REVISIT_AFTER earlier, whether the place is the same or not.
     """
     frames = recording.key_frames(least_shared=KEY_FRAME_SHARED)
     stamp = recording.dataset.stamp[frames]
-    vectors = [vocabulary.word_vector(vocabulary.quantise(words, detect(recording.grey(int(f))).desc)[0], words.idf) for f in frames]
+    vectors = [vocabulary.word_vector(vocabulary.quantize(words, detect(recording.grey(int(f))).desc)[0], words.idf) for f in frames]
     n_queries, n_found, best = 0, 0, []
     for k, vector in enumerate(vectors):
         earlier = np.flatnonzero(stamp < stamp[k] - REVISIT_AFTER)
@@ -203,7 +203,7 @@ def recall(recording: Recording, detect: Detector, words: vocabulary.Vocabulary)
 
 
 def at_full_precision(best: list[tuple[float, float]], n_queries: int) -> dict[str, float]:
-    """Give the recall when each query's best score above a threshold is accepted, the threshold the lowest that lets no other place in.
+    """Return the recall when each query's best score above a threshold is accepted, the threshold the lowest that lets no other place in.
 
     best : score and shared view of each query's best candidate
     """
@@ -244,7 +244,7 @@ def report(recording: Recording, settings: Config, n_pairs: int) -> Iterator[str
 
 
 def orb_bare() -> Callable[[np.ndarray], object]:
-    """Give plain ORB as it is, without making arrays of its key points."""
+    """Return plain ORB as it is, without making arrays of its key points."""
     plain = cv2.ORB_create(1000)
     return lambda grey: plain.detectAndCompute(grey, None)
 

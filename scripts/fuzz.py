@@ -332,7 +332,7 @@ def encoded(kind: str, rng: np.random.Generator, *, depth: bool = True) -> bytes
 
 
 def written(name: str, write: Callable[[Path], object]) -> tuple[bytes]:
-    """Give the bytes of a file that is written by our own code."""
+    """Return the bytes of a file that is written by our own code."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / name
         write(path)

@@ -69,7 +69,7 @@ def rows(short: RunDir, long: RunDir, first: int, frames: int) -> list[list[str]
 
 
 def seconds(run: RunDir, stage: str) -> float:
-    """Give a stage's CPU time without compiling [s]."""
+    """Return a stage's CPU time without compiling [s]."""
     record = run.record(stage)
     return record["cpu_seconds"] - record["compile_seconds"]
 

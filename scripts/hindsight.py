@@ -49,10 +49,10 @@ def main() -> None:
 
 
 def compared(run: RunDir) -> tuple[list[str], tuple[float, float]]:
-    """Give a line of the table and both errors [m]."""
+    """Return a line of the table and both errors [m]."""
     stamp, truth = run.load(Features, "extract").stamp, trajectory_error.ground_truth(run)
     with tempfile.TemporaryDirectory(dir=run.path.parent) as folder:  # where files can be linked instead of copied
-        without = accuracy.variant(run, Path(folder) / "without", toml.apply(run.config(), ["loop.hindsight=false"]))
+        without = accuracy.variant(run, Path(folder) / "without", toml.apply(run.config(), ["loop.final_refinement=false"]))
         before = frame_poses(run.load(Tracks, "track"), without.load(Map, "loop"))
     T_wc = (before, frame_poses(run.load(Tracks, "loop"), run.load(Map, "loop")))
     has_pose = [np.isfinite(T[:, 0, 0]) for T in T_wc]

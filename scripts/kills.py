@@ -130,7 +130,7 @@ class Stand:
         return faults
 
     def settled(self, where: str, command: tuple[str, ...]) -> list[str]:
-        """Give the same command again, bring the run up to date, and compare everything."""
+        """Return the same command again, bring the run up to date, and compare everything."""
         faults = []
         for again in (command, ("run", "-r", "run")):
             done = self.call(again)

@@ -49,7 +49,7 @@ def laser_grid(scene: Scene, T_sc: np.ndarray, T_lc: np.ndarray, like: Grid, rng
 
 
 def _cells(xy: np.ndarray, like: Grid) -> np.ndarray:
-    """Give the flat numbers of the cells that hold points (N, 2), each once."""
+    """Return the flat numbers of the cells that hold points (N, 2), each once."""
     column, row = np.floor((xy - like.origin) / float(like.resolution)).astype(np.int64).T
     rows, columns = like.state.shape
     inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)

@@ -108,7 +108,7 @@ def prepare(folder: Path, seed: int, settings: list[str], rate: float) -> Lab:
 
 
 def true_poses(run: RunDir) -> np.ndarray:
-    """Give T_sc (F, 4, 4) of every frame."""
+    """Return T_sc (F, 4, 4) of every frame."""
     truth = run.dataset().ground_truth()
     stamp = run.load(Features, "extract").stamp
     at = np.clip(np.searchsorted(truth.stamp, stamp - 1e-4), 0, len(truth.stamp) - 1)
@@ -160,7 +160,7 @@ def planned(lab: Lab) -> list[dict]:
 
 
 def opposite_places(lab: Lab, centre: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Give pairs of places (2,) on opposite sides of a box with room for the robot in both grids, those near to each other first."""
+    """Return pairs of places (2,) on opposite sides of a box with room for the robot in both grids, those near to each other first."""
     room = np.minimum(*(planner.obstacle_distance(grid, allow_unknown=False) for grid in (lab.grid, lab.laser))) >= RADIUS
     angle = np.arange(0.0, 2.0 * np.pi, np.pi / 12)
     direction = np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -223,7 +223,7 @@ def draw_all(folder: Path, lab: Lab, plans: list[dict]) -> None:
 
 
 def band_points(lab: Lab, low: float, high: float) -> np.ndarray:
-    """Give the cloud's points (N, 3) within the band."""
+    """Return the cloud's points (N, 3) within the band."""
     from slamcli.formats.cloud import read_ply
 
     xyz = read_ply(lab.run.stage_path("densify", "cloud.ply"))[0]

@@ -49,7 +49,7 @@ def main() -> None:
 
 
 def compare(arguments: argparse.Namespace, folder: Path) -> list[list[str]]:
-    """Give a row of the table for each layout."""
+    """Return a row of the table for each layout."""
     from datasets.test_same_recording import content_of
 
     dataset = open_dataset(arguments.recording)

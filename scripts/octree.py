@@ -84,7 +84,7 @@ def truth(run: RunDir) -> list[str]:
 
 
 def surface_distance(scene: grid_truth.Scene, x: np.ndarray) -> np.ndarray:
-    """Give the distance of points (N, 3) to the nearest surface of the room and the solids in it [m]."""
+    """Return the distance of points (N, 3) to the nearest surface of the room and the solids in it [m]."""
     out = np.abs(_box_distance(x - 0.5 * (scene.low + scene.high), 0.5 * (scene.high - scene.low)))
     for solid in scene.solids:
         local = x - np.array(solid["centre"])
@@ -114,30 +114,30 @@ def insertion(run: RunDir, *, stride: int) -> list[list[str]]:
     raw = [raw_scan(run, frame, T_lk, stride) for frame, T_lk in poses]
     points = np.mean([len(x) for x, _ in raw])
 
-    def ours(discretise: bool) -> Octree:
+    def ours(discretize: bool) -> Octree:
         grid = OccupancyMap(RESOLUTION, **MODEL)
         for x, origin in raw:
-            grid.insert(x, origin, max_range=MAX_RANGE, discretise=discretise)
+            grid.insert(x, origin, max_range=MAX_RANGE, discretize=discretize)
         return prune(grid.leaves())
 
-    def theirs(discretise: bool) -> "pyoctomap.OcTree":
+    def theirs(discretize: bool) -> "pyoctomap.OcTree":
         tree = pyoctomap.OcTree(RESOLUTION)
         for x, origin in raw:
-            tree.insertPointCloud(x.astype(np.float64), origin.astype(np.float64), max_range=MAX_RANGE, discretize=discretise)
+            tree.insertPointCloud(x.astype(np.float64), origin.astype(np.float64), max_range=MAX_RANGE, discretize=discretize)
         return tree
 
     rows = []
-    for discretise in (False, True):
+    for discretize in (False, True):
         times = dict.fromkeys((ours, theirs), np.inf)
         for _ in range(ROUNDS):
             for function in times:
-                times[function] = min(times[function], cpu_seconds(lambda f=function, d=discretise: f(d)))
+                times[function] = min(times[function], cpu_seconds(lambda f=function, d=discretize: f(d)))
         per_scan = {function: 1e3 * seconds / len(raw) for function, seconds in times.items()}
-        same, largest, n = difference(ours(discretise), theirs(discretise))
+        same, largest, n = difference(ours(discretize), theirs(discretize))
         rows.append(
             [
                 str(run.path),
-                "discretised" if discretise else "every point",
+                "discretized" if discretize else "every point",
                 f"{len(raw)}",
                 f"{points:.0f}",
                 f"{per_scan[theirs]:.1f}",
@@ -152,7 +152,7 @@ def insertion(run: RunDir, *, stride: int) -> list[list[str]]:
 
 
 def raw_scan(run: RunDir, frame: int, T_lk: np.ndarray, stride: int) -> tuple[np.ndarray, np.ndarray]:
-    """Give every stride-th reading of both directions as a point, uncleaned."""
+    """Return every stride-th reading of both directions as a point, uncleaned."""
     depth, rays = run.dataset().depth(frame)[::stride, ::stride], run.camera().rays[::stride, ::stride]
     seen = np.isfinite(depth)
     x_k = np.column_stack([rays[seen] * depth[seen][:, None], depth[seen]]).astype(np.float64)
@@ -160,14 +160,14 @@ def raw_scan(run: RunDir, frame: int, T_lk: np.ndarray, stride: int) -> tuple[np
 
 
 def cpu_seconds(work: Callable[[], object]) -> float:
-    """Give the CPU time of this thread."""
+    """Return the CPU time of this thread."""
     start = time.thread_time()
     work()
     return time.thread_time() - start
 
 
 def difference(ours: Octree, theirs: "pyoctomap.OcTree") -> tuple[float, float, int]:  # noqa: F821
-    """Give the share of cells of one class in both, the largest difference of log-odds, and the number of cells in either."""
+    """Return the share of cells of one class in both, the largest difference of log-odds, and the number of cells in either."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "theirs.ot"
         theirs.write(str(path))

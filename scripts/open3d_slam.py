@@ -43,7 +43,7 @@ def main() -> None:
 
 
 def track(root: Path, lines: list[list[str]], camera: dict, voxel: float) -> tuple[list[float], list[np.ndarray], float]:
-    """Give stamp and pose (4, 4) camera to world of each frame, and the CPU time spent on decoding [s]."""
+    """Return stamp and pose (4, 4) camera to world of each frame, and the CPU time spent on decoding [s]."""
     o3d = load_open3d()
     device = o3d.core.Device("CPU:0")
     matrix = o3d.core.Tensor([[camera["fx"], 0.0, camera["cx"]], [0.0, camera["fy"], camera["cy"]], [0.0, 0.0, 1.0]])

@@ -122,7 +122,7 @@ def one(folder: Path, name: str, settings: dict[str, Any], laps: float, rival: l
 
 
 def closures(run: RunDir) -> tuple[np.ndarray, np.ndarray]:
-    """Give the frames (C, 2) of each accepted closure and whether it is true (C,)."""
+    """Return the frames (C, 2) of each accepted closure and whether it is true (C,)."""
     found, stamp, truth = run.load(Closures, "loop"), run.load(Features, "extract").stamp, trajectory_error.ground_truth(run)
     T_gc = np.full((len(stamp), 4, 4), np.nan)
     rows = associate(stamp, truth.stamp)

@@ -13,17 +13,17 @@ SIZE_COLUMN = "octree / cloud, Zhao et al., published"
 
 
 def sequence(recording: str) -> str:
-    """Give the short name of a sequence, fr1_xyz, of whichever name a recording goes by."""
+    """Return the short name of a sequence, fr1_xyz, of whichever name a recording goes by."""
     return recording.split("/")[-1].replace("rgbd_dataset_freiburg", "fr")
 
 
 def ape(recording: str) -> list[str]:
-    """Give the cells of COLUMNS."""
+    """Return the cells of COLUMNS."""
     return [f"{value:.4f}" for value in APE[sequence(recording)]] if sequence(recording) in APE else [""] * len(COLUMNS)
 
 
 def size_share(recording: str) -> str:
-    """Give the cell of SIZE_COLUMN."""
+    """Return the cell of SIZE_COLUMN."""
     if sequence(recording) not in SIZES:
         return ""
     cloud, octree = SIZES[sequence(recording)]

@@ -37,7 +37,7 @@ def main() -> int:
 
 
 def pages() -> dict[Path, str]:
-    """Give the text of each page."""
+    """Return the text of each page."""
     return {
         DOCS / "options.md": "\n".join(options_page()) + "\n",
         DOCS / "artefacts.md": "\n".join(artefacts_page()) + "\n",
@@ -45,7 +45,7 @@ def pages() -> dict[Path, str]:
 
 
 def options_page() -> Iterator[str]:
-    """Give the lines of the page of options."""
+    """Return the lines of the page of options."""
     yield f"# Options\n\n{NOTE}"
     yield "Set one with `-s section.option=value` on `run` and on each stage's command, or in a TOML file given with `--config`."
     yield "A stage whose sections have changed is stale; no other is.\n"
@@ -63,7 +63,7 @@ def options_page() -> Iterator[str]:
 
 
 def artefacts_page() -> Iterator[str]:
-    """Give the lines of the page of artefacts."""
+    """Return the lines of the page of artefacts."""
     yield f"# Artefacts\n\n{NOTE}"
     yield "Beside the standard files, a stage's folder holds one plain `.npy` file an array. The names are those of the fields below; `numpy.load` reads each."
     yield f"This is format {schema.FORMAT}; a run of another one is told to run again. {_sentence(schema.__doc__)}\n"
@@ -81,7 +81,7 @@ def _records() -> list[type]:
 
 
 def _sentence(text: str | None) -> str:
-    """Give the notes of the module's docstring, from the second paragraph on, in one line."""
+    """Return the notes of the module's docstring, from the second paragraph on, in one line."""
     return " ".join((text or "").partition("\n\n")[2].split())
 
 

@@ -27,7 +27,7 @@ class Listed:
 
     @property
     def start(self) -> float:
-        """Give the stamp of the first colour image [s]."""
+        """Return the stamp of the first colour image [s]."""
         return self.colour[0][0]
 
 

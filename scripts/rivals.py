@@ -46,7 +46,7 @@ def figures(run: RunDir, command: list[str], out: Path) -> dict[str, Any]:
 
 
 def accuracy(run: RunDir, found: Any) -> dict[str, Any]:
-    """Give APE [m], None where no pose can be compared, and the share of colour frames with a pose."""
+    """Return APE [m], None where no pose can be compared, and the share of colour frames with a pose."""
     coverage = len(found.stamp) / n_frames(run)
     try:
         error = trajectory_error.ape(found, trajectory_error.ground_truth(run), n_frames=n_frames(run), name=str(run.path)).error
@@ -56,5 +56,5 @@ def accuracy(run: RunDir, found: Any) -> dict[str, Any]:
 
 
 def n_frames(run: RunDir) -> int:
-    """Give the number of colour frames."""
+    """Return the number of colour frames."""
     return int(run.record("extract")["summary"]["frames"])

@@ -61,7 +61,7 @@ def one(folder: Path, settings: dict[str, Any], rival: list[str] | None) -> list
         folder.name,
         str(n_frames),
         f"{100 * len(errors[-1]) / n_frames:.1f} %",
-        str(track["summary"]["on_shape"]),
+        str(track["summary"]["on_depth"]),
         *(f"{trajectory_error.statistics(error)['rmse']:.4f}" for error in errors),
         f"{cpu:.1f}",
         of_rival(run, *rival) if rival else "",
@@ -69,7 +69,7 @@ def one(folder: Path, settings: dict[str, Any], rival: list[str] | None) -> list
 
 
 def of_rival(run: RunDir, python: str, words: str) -> str:
-    """Give ORB-SLAM3's APE, a dash where it has no pose to compare."""
+    """Return ORB-SLAM3's APE, a dash where it has no pose to compare."""
     ape = rivals.orbslam3(run, python, words)["ape"]
     return "-" if ape is None else f"{ape:.4f}"
 

@@ -154,7 +154,7 @@ class Run:
         return self.directory.record(stage)
 
     def summary(self) -> dict[str, dict[str, Any]]:
-        """Give the figures that each finished stage counted, by stage."""
+        """Return the figures that each finished stage counted, by stage."""
         return {name: record["summary"] for name in NAMES if (record := self.record(name)) is not None}
 
     # what was made

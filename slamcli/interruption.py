@@ -20,7 +20,7 @@ class Interrupted(KeyboardInterrupt):
 
     @property
     def exit_status(self) -> int:
-        """Give the exit status by which a shell knows it."""
+        """Return the exit status by which a shell knows it."""
         return 128 + self.number
 
 

@@ -80,7 +80,7 @@ class Matches:
     distance: np.ndarray = array("u1", "Q", "Hamming distance, bits")
 
 
-LOST, TRACKED, KEY_FRAME, RELOCALISED, ON_SHAPE = range(5)  # values of Tracks.state
+LOST, TRACKED, KEY_FRAME, RELOCALIZED, ON_DEPTH = range(5)  # values of Tracks.state
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ class Tracks:
 
     ref_kf: np.ndarray = array("i4", "F", "row in Map of the key frame a frame hangs on, -1 = lost")
     T_kc: np.ndarray = array("f8", "F 4 4", "frame's camera to that key frame's camera, NaN = lost")
-    state: np.ndarray = array("u1", "F", "0 lost, 1 tracked, 2 key frame, 3 relocalised, 4 tracked on the shape that depth shows")
+    state: np.ndarray = array("u1", "F", "0 lost, 1 tracked, 2 key frame, 3 relocalized, 4 tracked on the shape that depth shows")
     n_inliers: np.ndarray = array("i4", "F", "landmarks the pose rests on")
 
 
@@ -190,12 +190,12 @@ class Trajectory:
 
 
 def frame_segments(tracks: Tracks, map_: Map) -> np.ndarray:
-    """Give the map segment (F,) of every frame, -1 where lost."""
+    """Return the map segment (F,) of every frame, -1 where lost."""
     return np.where(tracks.ref_kf >= 0, map_.kf_segment[tracks.ref_kf], -1) if len(map_.kf_segment) else np.full_like(tracks.ref_kf, -1)
 
 
 def frame_poses(tracks: Tracks, map_: Map, segment: int = 0) -> np.ndarray:
-    """Give T_wc (F, 4, 4) of every frame of a map segment under its key-frame poses, NaN for the lost and for those of other segments."""
+    """Return T_wc (F, 4, 4) of every frame of a map segment under its key-frame poses, NaN for the lost and for those of other segments."""
     T_wc = np.full((len(tracks.ref_kf), 4, 4), np.nan)
     is_here = frame_segments(tracks, map_) == segment
     T_wc[is_here] = map_.T_wk[tracks.ref_kf[is_here]] @ tracks.T_kc[is_here]
@@ -203,7 +203,7 @@ def frame_poses(tracks: Tracks, map_: Map, segment: int = 0) -> np.ndarray:
 
 
 def trajectory(stamp: np.ndarray, tracks: Tracks, map_: Map, segment: int = 0) -> Trajectory:
-    """Give the poses of the frames of a map segment."""
+    """Return the poses of the frames of a map segment."""
     T_wc = frame_poses(tracks, map_, segment)
     has_pose = np.isfinite(T_wc[:, 0, 0])
     return Trajectory(stamp=stamp[has_pose], T_wc=T_wc[has_pose])

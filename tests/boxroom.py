@@ -12,7 +12,7 @@ KINECT = Camera(160, 120, 147.3, 152.3, 79.5, 59.5)  # 57 x 43 degrees
 
 
 def look_along(position, yaw, pitch, roll=0.0):
-    """Give T_lc (4, 4) of a camera at a level position, heading `yaw`, looking `pitch` down, turned `roll` about its axis [rad]."""
+    """Return T_lc (4, 4) of a camera at a level position, heading `yaw`, looking `pitch` down, turned `roll` about its axis [rad]."""
     cos, sin = np.cos, np.sin
     forward = np.array([cos(yaw) * cos(pitch), sin(yaw) * cos(pitch), -sin(pitch)])
     right = np.array([sin(yaw), -cos(yaw), 0.0])
@@ -54,7 +54,7 @@ def kinect_noise(depth, rng, near=0.5, far=4.0):
 
 
 def round_trip(*, height=0.6, pitch=0.25, step=0.15, margin=0.9, turn=0.2):
-    """Give T_lc (N, 4, 4) of a drive once around the room, counter-clockwise, turning on the spot in the corners."""
+    """Return T_lc (N, 4, 4) of a drive once around the room, counter-clockwise, turning on the spot in the corners."""
     corners = np.array([[margin, margin], [8 - margin, margin], [8 - margin, 5 - margin], [margin, 5 - margin]])
     poses = []
     for k in range(4):

@@ -81,7 +81,7 @@ def make_run(path: Path, root: Path, config: Config | None = None) -> Pipeline:
 
 
 def digests(run: RunDir) -> dict[str, str]:
-    """Give each finished stage's output digest."""
+    """Return each finished stage's output digest."""
     return {stage.name: record["digest"] for stage in STAGES if (record := run.record(stage.name))}
 
 

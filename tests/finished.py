@@ -151,7 +151,8 @@ def _map(T_wk: np.ndarray, kf_frame: np.ndarray) -> Map:
 
 def _record(run: RunDir, stage: pipeline.Stage, out: Path, frames: int) -> dict:
     declared = staleness.declared(stage, run.config())
-    code = dict(source_code.of_stage(stage.name))
+    reader = "tum" if "dataset" in stage.needs else ""
+    code = dict(source_code.of_stage(stage.name, reader))
     inputs = {need: "sha256:0" if need == "dataset" else run.record(need)["digest"] for need in stage.needs}
     files = outputs(out)
     return {
@@ -159,5 +160,5 @@ def _record(run: RunDir, stage: pipeline.Stage, out: Path, frames: int) -> dict:
         "config": declared, "inputs": inputs, "code": code, "outputs": files,
         "digest": digest({name: entry["sha256"] for name, entry in files.items()}), "environment": pipeline.environment(),
         "seconds": 1.5, "cpu_seconds": 2.0, "compile_seconds": 0.0, "fps": frames / 1.5, "peak_rss_mb": 200.0,
-        "summary": {"frames": frames}, "warnings": [], "n_warnings": 0, "reader": "tum",
+        "summary": {"frames": frames}, "warnings": [], "n_warnings": 0, "reader": reader,
     }  # fmt: skip

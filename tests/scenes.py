@@ -26,7 +26,7 @@ class Scene:
 
 
 def look_at(position: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Give T_gc of an upright camera (world z up)."""
+    """Return T_gc of an upright camera (world z up)."""
     z = (target - position) / np.linalg.norm(target - position)
     x = np.cross(z, [0.0, 0.0, 1.0])
     x /= np.linalg.norm(x)
@@ -37,19 +37,19 @@ def look_at(position: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 def orbit(n: int, *, turns: float = 0.25, radius: float = 1.0) -> np.ndarray:
-    """Give T_gc (n, 4, 4) of a camera on a circle that looks outward."""
+    """Return T_gc (n, 4, 4) of a camera on a circle that looks outward."""
     angle = np.linspace(0.0, turns * 2.0 * np.pi, n)
     out = np.stack([np.cos(angle), np.sin(angle), np.zeros(n)], axis=1)
     return np.array([look_at(radius * d, 4.0 * d) for d in out])
 
 
 def sweep(n: int, *, length: float = 0.6) -> np.ndarray:
-    """Give T_gc (n, 4, 4) of a camera that moves sideways in front of the wall x = 3."""
+    """Return T_gc (n, 4, 4) of a camera that moves sideways in front of the wall x = 3."""
     return np.array([look_at(np.array([0.0, y, 0.1 * np.sin(6 * y)]), np.array([3.0, 0.8 * y, 0.0])) for y in np.linspace(0, length, n)])
 
 
 def room_points(n: int, rng: np.random.Generator, *, radius: float = 3.0) -> np.ndarray:
-    """Give landmarks (n, 3) on a wavy cylinder wall around the origin."""
+    """Return landmarks (n, 3) on a wavy cylinder wall around the origin."""
     angle, height = rng.uniform(0, 2 * np.pi, n), rng.uniform(-2.0, 2.0, n)
     r = radius + 0.3 * np.sin(5 * angle) + 0.2 * np.sin(7 * height)
     return np.stack([r * np.cos(angle), r * np.sin(angle), height], axis=1)
@@ -117,7 +117,7 @@ def flip_bits(desc: np.ndarray, n: int, rng: np.random.Generator) -> np.ndarray:
 
 
 def words_of(landmark: np.ndarray, offset: np.ndarray, n_words: int) -> Words:
-    """Give every landmark a word of its own."""
+    """Return every landmark a word of its own."""
     word, weight, bow_offset = [], [], [0]
     for a, b in zip(offset[:-1], offset[1:], strict=True):
         ids = np.unique(landmark[a:b])
@@ -154,7 +154,7 @@ def matches_of(landmark: np.ndarray, offset: np.ndarray) -> Matches:
 
 
 def ape(T_wc: np.ndarray, T_gc: np.ndarray) -> float:
-    """Give the RMS position error [m] after rigid alignment, of the frames that have a pose."""
+    """Return the RMS position error [m] after rigid alignment, of the frames that have a pose."""
     has_pose = np.isfinite(T_wc[:, 0, 0])
     T_gw, _ = se3.umeyama(T_wc[has_pose, :3, 3], T_gc[has_pose, :3, 3])
     error = se3.transform(T_gw, T_wc[has_pose, :3, 3]) - T_gc[has_pose, :3, 3]

@@ -53,7 +53,7 @@ def layer_of(path: Path) -> str:
 
 
 def imports(tree: ast.AST) -> Iterator[tuple[str, bool]]:
-    """Give each imported module's dotted name, and whether the import is at the top; what only type checkers see is left out."""
+    """Return each imported module's dotted name, and whether the import is at the top; what only type checkers see is left out."""
     for node in ast.iter_child_nodes(tree):
         if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
             continue
@@ -72,7 +72,7 @@ def parsed(path: Path) -> ast.Module:
 
 
 def rooms_used(path: Path) -> set[str]:
-    """Give the rooms that a file imports from."""
+    """Return the rooms that a file imports from."""
     used = {name.split(".")[1] for name, _ in imports(parsed(path)) if name.startswith("slamcli.")}
     return {room if room in FLOOR_OF else "__init__" for room in used} - {layer_of(path)}
 

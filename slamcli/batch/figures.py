@@ -41,7 +41,7 @@ tr.failed td{background:#fdeeee}tr.doubted td{background:#fff8e5}tfoot td{font-w
 
 
 def of_run(run: RunDir) -> dict[str, Any]:
-    """Give the figures of a run as far as it went: coverage, APE where there is truth, what to doubt, and what it cost."""
+    """Return the figures of a run as far as it went: coverage, APE where there is truth, what to doubt, and what it cost."""
     records = [record for name in NAMES if (record := run.record(name)) is not None]
     found: dict[str, Any] = {
         "seconds": round(sum(record["seconds"] for record in records), 1),

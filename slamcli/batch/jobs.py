@@ -50,7 +50,7 @@ class Job:
 
 
 def jobs(recordings: Sequence[str], order: Order) -> list[Job]:
-    """Give each recording a run of its own, named after it; SlamError for none, and for one that is named twice."""
+    """Return each recording a run of its own, named after it; SlamError for none, and for one that is named twice."""
     found = [_absolute(recording) for recording in _listed(recordings)]
     if not found:
         raise SlamError("no recording to work off; name some, or a list of them: a .txt file with one a line")
@@ -97,7 +97,7 @@ def absolute_out(out: str) -> str:
 
 
 def with_threads(order: Order, threads: int) -> Order:
-    """Give each stage so many threads; its result does not depend on them."""
+    """Return each stage so many threads; its result does not depend on them."""
     return replace(order, threads=threads)
 
 

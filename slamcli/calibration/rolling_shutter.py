@@ -22,7 +22,7 @@ LARGEST_GAP = 0.2  # [s] between neighbouring frames; over a longer one the moti
 
 
 def twists(stamp: np.ndarray, T_wc: np.ndarray) -> np.ndarray:
-    """Give each frame's motion (F, 6) [m/s, rad/s] in its own camera frame: the slope of a cubic through the frames around it.
+    """Return each frame's motion (F, 6) [m/s, rad/s] in its own camera frame: the slope of a cubic through the frames around it.
 
     T_wc : (F, 4, 4), NaN = lost. Where one of these frames is missing a straight line has to do, and 0 where all are.
 
@@ -48,13 +48,13 @@ def twists(stamp: np.ndarray, T_wc: np.ndarray) -> np.ndarray:
 
 
 def frame_twists(stamp: np.ndarray, tracks: Tracks, map_: Map) -> np.ndarray:
-    """Give each frame's motion (F, 6) as `twists` does, each map segment for itself."""
+    """Return each frame's motion (F, 6) as `twists` does, each map segment for itself."""
     segments = range(int(map_.kf_segment.max(initial=0)) + 1)
     return np.sum([twists(stamp, frame_poses(tracks, map_, segment)) for segment in segments], axis=0)
 
 
 def velocity(xyz_c: np.ndarray, twist: np.ndarray) -> np.ndarray:
-    """Give how fast resting points (N, 3) [m, camera] move in a camera that moves by `twist` (N, 6) or (6,); (N, 3) [m/s]."""
+    """Return how fast resting points (N, 3) [m, camera] move in a camera that moves by `twist` (N, 6) or (6,); (N, 3) [m/s]."""
     return -(twist[..., :3] + np.cross(twist[..., 3:], xyz_c))
 
 
@@ -69,7 +69,7 @@ class Flow:
 
 
 def flow(features: Features, twist: np.ndarray, camera: Camera, rows: np.ndarray) -> Flow:
-    """Give what the camera's motion `twist` (F, 6) does to the measurements `rows` (N,)."""
+    """Return what the camera's motion `twist` (F, 6) does to the measurements `rows` (N,)."""
     frame = np.searchsorted(features.offset, rows, side="right") - 1
     xy = np.asarray(features.xy[rows], dtype=np.float64)
     depth = np.asarray(features.depth[rows], dtype=np.float64)
@@ -82,7 +82,7 @@ def flow(features: Features, twist: np.ndarray, camera: Camera, rows: np.ndarray
 
 
 def rectify(features: Features, timing: Timing, camera: Camera) -> Features:
-    """Give the features as a camera would have measured them that takes the whole image, and its depth, at the colour stamp.
+    """Return the features as a camera would have measured them that takes the whole image, and its depth, at the colour stamp.
 
     A depth image taken later by t was read at the pixel where the point was in the colour image, not where it has gone to since: on a
     slanted surface that is another point. The reading has changed by t times what the point's depth does less what the slant makes of
@@ -139,12 +139,12 @@ def _rectify(
 
 
 def depth_lag(features: Features, timing: Timing) -> np.ndarray:
-    """Give by how much the middle row of each frame's depth was taken later than its colour image's, (F,) [s]; 0 where it is not to be moved."""
+    """Return by how much the middle row of each frame's depth was taken later than its colour image's, (F,) [s]; 0 where it is not to be moved."""
     return np.nan_to_num(features.depth_stamp - features.stamp + float(timing.depth_delay))
 
 
 def depth_to_colour(features: Features, when: Timing, frames: np.ndarray) -> np.ndarray:
-    """Give per frame of `frames` (N,) its camera when depth was measured to its camera when colour was, (N, 4, 4)."""
+    """Return per frame of `frames` (N,) its camera when depth was measured to its camera when colour was, (N, 4, 4)."""
     later = features.depth_stamp[frames] + float(when.depth_delay) - features.stamp[frames]
     return se3.exp(when.twist[frames] * np.nan_to_num(later)[:, None])
 

@@ -14,7 +14,7 @@ from slamcli.estimation import bundle_adjustment, shared_parameters
 from slamcli.geometry.camera import Camera
 from slamcli.schema import Features, Timing
 from slamcli.sparse_map import map_adjustment
-from slamcli.sparse_map.sparse_map import MapBuilder
+from slamcli.sparse_map.sparse_map import SparseMap
 
 TIMES = "readout", "depth_readout", "depth_delay"  # fields of Timing that are looked for
 SIGNIFICANT = 3.0  # standard deviations
@@ -32,7 +32,7 @@ class Sensing:
 
 
 def unknowns(camera: Camera, option: OptimizeConfig) -> dict[str, float]:
-    """Give the numbers to be found, fields of Timing or Camera, and how far each is believed to be from what the recording says."""
+    """Return the numbers to be found, fields of Timing or Camera, and how far each is believed to be from what the recording says."""
     prior = {}
     if option.readout:
         prior["readout"] = option.timing_prior
@@ -49,12 +49,12 @@ def unknowns(camera: Camera, option: OptimizeConfig) -> dict[str, float]:
 
 
 def correct(features: Features, given: Camera, sensing: Sensing) -> Features:
-    """Give features, measured under the calibration `given`, as they are under what is known of the camera now."""
+    """Return features, measured under the calibration `given`, as they are under what is known of the camera now."""
     return rolling_shutter.rectify(recalibrate(features, given, sensing.camera), sensing.timing, sensing.camera)
 
 
 def recalibrate(features: Features, given: Camera, camera: Camera) -> Features:
-    """Give features, measured under the calibration `given`, as they are under another one of the same camera."""
+    """Return features, measured under the calibration `given`, as they are under another one of the same camera."""
     if camera == given:
         return features
     xy = np.empty_like(features.xy)
@@ -65,22 +65,24 @@ def recalibrate(features: Features, given: Camera, camera: Camera) -> Features:
     return replace(features, xy=xy, depth=camera.reread(features.depth, given), slope=slope)
 
 
-def estimate_sensing(builder: MapBuilder, given: Camera, now: Sensing, sensor: SensorConfig, *, prior: dict[str, float]) -> Sensing | None:
+def estimate_sensing(
+    sparse_map: SparseMap, given: Camera, now: Sensing, sensor: SensorConfig, *, prior: dict[str, float]
+) -> Sensing | None:
     """Find the unknowns at an adjusted map whose features were corrected by `now`.
 
     given : the recording's calibration; prior : as `unknowns` gives it, standard deviations of the timing around 0, of the rest around `given`
     Returns better numbers, with the same motion, those as before that do not differ significantly; None where the map is not determined.
     """
-    part = map_adjustment.gather(builder, np.arange(len(builder.kf), dtype=np.int32), sensor)
+    part = map_adjustment.gather(sparse_map, np.arange(len(sparse_map.kf), dtype=np.int32), sensor)
     if len(part.row) == 0 or not prior:
         return None
-    T_kw, x_w = builder.T_kw(part.kfs), builder.lm.xyz[part.ids]
+    T_kw, x_w = sparse_map.T_kw(part.kfs), sparse_map.lm.xyz[part.ids]
     problem = bundle_adjustment.Problem(T_kw, x_w, part.seen, now.camera, part.is_fixed, part.edges)
     names = list(prior)
     predicted = problem.in_given_order(problem.predict(problem.T, problem.x))
     # What an offset bends is to turn about readings of this depth, so that it changes no size that the depth scale answers for.
     pivot = float(np.median(predicted[:, 2]))
-    columns = np.stack([_column(name, builder.features, part.row, predicted, now, prior[name], pivot) for name in names], axis=2)
+    columns = np.stack([_column(name, sparse_map.features, part.row, predicted, now, prior[name], pivot) for name in names], axis=2)
     value, centre = (
         np.array([_number(name, camera, when, pivot) for name in names]) for camera, when in ((now.camera, now.timing), (given, None))
     )
@@ -98,7 +100,10 @@ def estimate_sensing(builder: MapBuilder, given: Camera, now: Sensing, sensor: S
 
 
 def _number(name: str, camera: Camera, when: Timing | None, pivot: float) -> float:
-    """Look up an unknown; without timing, what is believed of it before looking. The depth scale is that of readings at depth `pivot` [m]."""
+    """Return the current value of a calibration parameter, or its prior when it has not been estimated (`when` is None).
+
+    The depth scale is that of readings at depth `pivot` [m].
+    """
     if name == "depth_scale":
         return camera.depth_scale / (1.0 - camera.inverse_depth_offset * pivot)
     if hasattr(camera, name):
@@ -107,7 +112,7 @@ def _number(name: str, camera: Camera, when: Timing | None, pivot: float) -> flo
 
 
 def _column(name: str, features: Features, rows: np.ndarray, predicted: np.ndarray, now: Sensing, sigma: float, pivot: float) -> np.ndarray:
-    """Give by how much the measurements `rows` (O,) grow per unit of an unknown, (O, 3) [px, px, m].
+    """Return by how much the measurements `rows` (O,) grow per unit of an unknown, (O, 3) [px, px, m].
 
     predicted : (O, 3) [px, px, m] where the map says they should be. Readings themselves would not do for what stretches them: it
     stretches their errors too, and the least errors are those of the smallest camera.
@@ -135,5 +140,5 @@ def _column(name: str, features: Features, rows: np.ndarray, predicted: np.ndarr
     raw, step = now.camera.distort(predicted[:, :2]), STEP * sigma
     ahead, behind = (replace(now.camera, **{name: getattr(now.camera, name) + d}) for d in (step, -step))
     focal = np.array([now.camera.fx, now.camera.fy])
-    column[:, :2] = (ahead.normalise(raw) - behind.normalise(raw)) * focal / (2.0 * step)
+    column[:, :2] = (ahead.normalize(raw) - behind.normalize(raw)) * focal / (2.0 * step)
     return column

@@ -195,7 +195,7 @@ def _frame_stamp(folder: RunDir) -> np.ndarray:
 
 
 def _trajectories(folder: RunDir, stage: str | None, other: tuple[str, ...]) -> list[tuple[str, str, Trajectory]]:
-    """Give (name, stage, trajectory) of the run's stages asked for, then of other systems, whose stage is ""."""
+    """Return (name, stage, trajectory) of the run's stages asked for, then of other systems, whose stage is ""."""
     from slamcli.evaluation import trajectory_error
     from slamcli.formats.trajectory import read_tum
 

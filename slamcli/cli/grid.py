@@ -299,7 +299,7 @@ def _read_map(page: Path) -> Grid:
 
 
 def camera_path(folder: RunDir) -> np.ndarray:
-    """Give the camera centres (F, 3) of every frame in the level frame, NaN where lost."""
+    """Return the camera centres (F, 3) of every frame in the level frame, NaN where lost."""
     from slamcli.geometry import se3
     from slamcli.schema import Ground, Map, Tracks, frame_poses
 

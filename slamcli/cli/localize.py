@@ -27,12 +27,12 @@ def localize(run: str, recording: str, out: Path, data: str | None, as_json: boo
     from slamcli import console
     from slamcli.datasets import open_dataset
     from slamcli.formats.trajectory import write_tum
-    from slamcli.runs.localization import localise
+    from slamcli.runs.localization import localize
     from slamcli.runs.run_directory import RunDir
 
     folder = RunDir.find(run)
     dataset = open_dataset(recording, data=data, camera=dict(folder.config().camera) or None, progress=console.progress)
-    found = localise(folder, dataset, progress=console.progress)
+    found = localize(folder, dataset, progress=console.progress)
     write_tum(out, found.trajectory)
     figures = found.to_dict()
     click.echo(

@@ -194,7 +194,7 @@ def _draw_octree(folder: RunDir, view: View, path: np.ndarray | None) -> np.ndar
 
 
 def _camera_path(folder: RunDir) -> np.ndarray:
-    """Give the camera centres (N, 3) of the frames that have a pose, in the level frame."""
+    """Return the camera centres (N, 3) of the frames that have a pose, in the level frame."""
     from slamcli.runs import placement
     from slamcli.schema import Ground
 

@@ -156,14 +156,14 @@ class TrackConfig:
     search_max_distance: int = option(80, "descriptors that differ more do not match [bits]", ge=1, le=256)
     search_ratio: float = option(0.8, "best against second best distance of the same octave", gt=0, le=1)
     local_key_frames: int = option(20, "key frames whose landmarks are looked for in a frame", ge=1)
-    relocalise_candidates: int = option(5, "key frames tried after loss, best word score first", ge=1)
-    relocalise_inliers: int = option(45, "landmarks that must agree to recognise a place after loss; as for a closure", ge=4)
+    relocalize_candidates: int = option(5, "key frames tried after loss, best word score first", ge=1)
+    relocalize_inliers: int = option(45, "landmarks that must agree to recognize a place after loss; as for a closure", ge=4)
     segment_after: int = option(10, "frames lost in a row at which a new map segment begins; 0 = never", ge=0)
     key_frame_share: float = option(0.6, "a frame that holds less of its reference key frame's landmarks becomes one", gt=0, le=1)
     key_frame_gap: int = option(8, "frames between key frames at most", ge=1)
     key_frame_crowd: int = option(12, "no key frame where so many stand within 0.1 m and 6 degrees already", ge=1)
-    shape_below: int = option(150, "with fewer landmarks, a frame is aligned by its depth image; 0 = without any", ge=0)
-    shape_hold: float = option(1.0, "how long motion continues in directions that depth leaves open, as along a wall [s]", ge=0, le=10)
+    depth_icp_below: int = option(150, "with fewer landmarks, a frame is aligned by its depth image; 0 = without any", ge=0)
+    depth_icp_hold: float = option(1.0, "how long motion continues in directions that depth leaves open, as along a wall [s]", ge=0, le=10)
     moving_objects: bool = option(True, "find what moves, such as people; poses and maps rest on what stands still")
     share_key_frames: int = option(10, "neighbours in which a new key frame's landmarks are looked for", ge=0)
     share_max_distance: int = option(50, "descriptors that differ more are not one landmark [bits]", ge=1, le=256)
@@ -177,7 +177,7 @@ class OptimizeConfig:
 
     enabled: bool = option(True, "false: the map passes through")
     iterations: int = option(30, "rounds of global bundle adjustment at most", ge=1)
-    shape_edges: int = option(
+    depth_icp_edges: int = option(
         3,
         "earlier key frames that each key frame's depth image is aligned with; 0 = none",
         ge=0,
@@ -229,14 +229,14 @@ class LoopConfig:
     iterations: int = option(20, "rounds of each global bundle adjustment at most", ge=1)
     join_closures: int = option(2, "closures that must agree on how two map segments lie before these are joined", ge=1)
     main_segment: int = option(0, "map segment that the maps are made of; 0 = the largest", ge=0)
-    hindsight: bool = option(True, "once loops are closed, match every frame again against the final map")
-    shape_edges: int = option(
+    final_refinement: bool = option(True, "once loops are closed, match every frame again against the final map")
+    depth_icp_edges: int = option(
         6,
         "earlier key frames that each depth image is then aligned with; 0 = none",
         ge=0,
         le=50,
     )
-    shape_weight: float = option(
+    depth_icp_weight: float = option(
         2.0,
         "weight of those alignments in the last adjustment; in optimize it is 1",
         gt=0,

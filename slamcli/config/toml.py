@@ -104,7 +104,7 @@ def _parse(text: str) -> Any:
 
 
 def resolve(base: Config | None, name_or_file: str | None, settings: Settings) -> Config:
-    """Give the configuration of a command: `base` (a run's own, or the defaults) unless a configuration is named, then each setting."""
+    """Return the configuration of a command: `base` (a run's own, or the defaults) unless a configuration is named, then each setting."""
     config = base or Config()
     if name_or_file:
         config = read(find(name_or_file))

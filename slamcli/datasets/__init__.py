@@ -1,4 +1,4 @@
-"""Recordings: find one by name, recognise its layout, open it."""
+"""Recordings: find one by name, recognize its layout, open it."""
 
 import os
 import re
@@ -60,7 +60,7 @@ def _not_a_recording(path: Path) -> str:
 
 
 def _locate(target: str, data: str | None, progress: Progress) -> tuple[Path, str]:
-    """Give (folder, name), downloading or rendering what is not there."""
+    """Return (folder, name), downloading or rendering what is not there."""
     if target == DEMO:
         from slamcli.datasets.demo import demo_folder
 
@@ -93,7 +93,7 @@ def _data_roots(data: str | None) -> list[Path]:
 
 
 def _variants(target: str) -> list[str]:
-    """Give the folders below a data root that a name can mean; the root may be the folder `tum` itself."""
+    """Return the folders below a data root that a name can mean; the root may be the folder `tum` itself."""
     sequence = _tum_sequence(target)
     names = [target] if not Path(target).is_absolute() else []
     for form in [sequence, _short(sequence)] if sequence else []:
@@ -102,7 +102,7 @@ def _variants(target: str) -> list[str]:
 
 
 def _tum_sequence(target: str) -> str | None:
-    """Give the full name of a TUM sequence from any of its forms, None for what is none."""
+    """Return the full name of a TUM sequence from any of its forms, None for what is none."""
     short = target.removeprefix("tum/")
     if short in ALIASES:
         return ALIASES[short]
@@ -116,7 +116,7 @@ def _short(sequence: str) -> str:
 
 
 def _name_of(folder: Path) -> str:
-    """Give the name of a recording, fit for a folder below runs/."""
+    """Return the name of a recording, fit for a folder below runs/."""
     name = folder.resolve().stem if folder.is_file() else folder.resolve().name
     sequence = _tum_sequence(name)
     if sequence:

@@ -78,7 +78,7 @@ def assemble(found: Recorded, *, name: str, camera: dict[str, Any] | None = None
 
 
 def reduction_of(width: int, height: int) -> int:
-    """Give by how many times pictures are made smaller: large ones cost time and add nothing to poses."""
+    """Return by how many times pictures are made smaller: large ones cost time and add nothing to poses."""
     return 1 if width * height <= LARGE else math.ceil(math.sqrt(width * height / WORKING))
 
 
@@ -145,7 +145,7 @@ def _masks(found: Recorded) -> Images | None:
 
 
 def _depth_scale(found: Recorded, probe: _Probe, override: dict[str, Any] | None) -> tuple[float, list[str]]:
-    """Give the depth scale of a recording, and what must be said of it."""
+    """Return the depth scale of a recording, and what must be said of it."""
     given = (override or {}).get("depth_scale", found.calibration.values.get("depth_scale", found.depth_scale))
     is_float = bool(probe.raw) and probe.raw[0].dtype != np.uint16
     if given is not None and not (is_float and given == found.depth_scale):

@@ -115,7 +115,7 @@ class _Parts:
         return os.pread(self._file, min(n, self._size - start), start) if 0 <= start < self._size and n > 0 else b""
 
     def unpacked(self, key: int, unpack: Callable[[], bytes]) -> bytes:
-        """Give a part, unpacked once for messages that follow each other."""
+        """Return a part, unpacked once for messages that follow each other."""
         with self._lock:
             if key not in self._kept:
                 try:

@@ -65,7 +65,7 @@ def _found(root: Path, files: tuple[str, ...]) -> Calibration:
 
 
 def find_camera(folder: Path, override: dict[str, Any] | None, image_size: tuple[int, int] | None) -> Camera:
-    """Give the camera of a folder by what is in it; see `complete`."""
+    """Return the camera of a folder by what is in it; see `complete`."""
     return complete(find_calibration(folder).with_defaults(), folder, override=override, size=image_size)
 
 

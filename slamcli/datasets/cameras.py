@@ -44,13 +44,13 @@ NOMINAL = {
 
 
 def freiburg_number(name: str) -> int | None:
-    """Give n for names such as ``rgbd_dataset_freiburgN_desk``, ``freiburgN_desk`` and ``frN_desk``."""
+    """Return n for names such as ``rgbd_dataset_freiburgN_desk``, ``freiburgN_desk`` and ``frN_desk``."""
     found = re.match(r"(?:rgbd_dataset_)?(?:freiburg|fr)([123])_", name)
     return int(found.group(1)) if found else None
 
 
 def nominal(name: str, width: int, height: int) -> dict[str, float]:
-    """Give the intrinsics of a camera by its name for pictures of a size; upright pictures of a camera that was turned, too."""
+    """Return the intrinsics of a camera by its name for pictures of a size; upright pictures of a camera that was turned, too."""
     if name not in NOMINAL:
         raise SlamError(f"camera {name!r} is not known by name; known are {', '.join(NOMINAL)}")
     focal = NOMINAL[name].focal_by_height * min(width, height)

@@ -129,7 +129,7 @@ def _repeated(raw: np.ndarray, what: str, fps: float | None) -> Clock:
 
 
 def _unit_of_epoch(raw: np.ndarray) -> str | None:
-    """Give the unit under which stamps are dates of our time, and their steps those of a camera."""
+    """Return the unit under which stamps are dates of our time, and their steps those of a camera."""
     middle, step = float(np.median(raw)), np.diff(np.unique(raw))
     typical = float(np.median(step)) if len(step) else 0.0
     return next(
@@ -138,7 +138,7 @@ def _unit_of_epoch(raw: np.ndarray) -> str | None:
 
 
 def _unit(raw: np.ndarray) -> tuple[str, bool]:
-    """Give the unit of stamps, and whether their pace is a camera's then."""
+    """Return the unit of stamps, and whether their pace is a camera's then."""
     step = np.diff(np.unique(raw))
     typical = float(np.median(step))
     unit = _unit_of_epoch(raw)

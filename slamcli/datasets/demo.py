@@ -13,7 +13,7 @@ Progress = Callable[..., Iterable]
 
 
 def demo_folder(cache: Path, *, progress: Progress) -> Path:
-    """Give the folder of the demo recording, rendering it first where it is missing."""
+    """Return the folder of the demo recording, rendering it first where it is missing."""
     folder = cache / f"demo-{VERSION}"
     if not folder.is_dir():
         cache.mkdir(parents=True, exist_ok=True)

@@ -152,7 +152,7 @@ def _drain(stream: gzip.GzipFile) -> None:
 
 
 def _inside(member: tarfile.TarInfo, top: str) -> PurePosixPath:
-    """Give a member's path below the top folder; SlamError for whatever a recording does not consist of."""
+    """Return a member's path below the top folder; SlamError for whatever a recording does not consist of."""
     path = PurePosixPath(member.name)
     harmless = not path.is_absolute() and ".." not in path.parts and "\\" not in member.name and ":" not in member.name
     plain = member.type in (tarfile.REGTYPE, tarfile.AREGTYPE, tarfile.DIRTYPE)

@@ -26,7 +26,7 @@ class Folder:
         return sorted(self._names(below).values())
 
     def find(self, listed: str, homes: tuple[str, ...] = ()) -> str:
-        """Give the file that a list means, relative to the root; the name as listed (tidied) where there is none.
+        """Return the file that a list means, relative to the root; the name as listed (tidied) where there is none.
 
         Backslashes, another case, another suffix and paths of the machine that wrote the list are seen through; what leads out of the
         folder is refused with SlamError. `homes` are folders to look in where a bare name is not in the root.
@@ -63,7 +63,7 @@ class Folder:
         return str(PurePosixPath(folder, found)) if found is not None else None
 
     def _names(self, folder: str) -> dict[str, str]:
-        """Give the files of a folder by their name and by its lower case."""
+        """Return the files of a folder by their name and by its lower case."""
         if folder not in self._listed:
             try:
                 with os.scandir(self.root / folder) as entries:
@@ -74,7 +74,7 @@ class Folder:
         return self._listed[folder]
 
     def _as_spelt(self, folder: str) -> str:
-        """Give the folder's name as the file system spells it; unchanged where it is there, or not there in any spelling."""
+        """Return the folder's name as the file system spells it; unchanged where it is there, or not there in any spelling."""
         try:
             is_there = not folder or (self.root / folder).is_dir()
         except (OSError, ValueError):  # a name that no folder can have
@@ -84,7 +84,7 @@ class Folder:
         return subfolder(self.root, (folder.lower(),)) or folder
 
     def _stem_table(self, folder: str) -> dict[str, str]:
-        """Give the images of a folder by their name without suffix."""
+        """Return the images of a folder by their name without suffix."""
         if folder not in self._stems:
             names = sorted(set(self._names(folder).values()), reverse=True)
             self._stems[folder] = {Path(n).stem.lower(): n for n in names if Path(n).suffix.lower() in DEPTH_SUFFIXES}
@@ -92,7 +92,7 @@ class Folder:
 
 
 def subfolder(root: Path, names: tuple[str, ...]) -> str | None:
-    """Give the first of these folders that is there, whatever its case."""
+    """Return the first of these folders that is there, whatever its case."""
     try:
         there = {entry.name.lower(): entry.name for entry in os.scandir(root) if entry.is_dir()}
     except OSError:
@@ -101,7 +101,7 @@ def subfolder(root: Path, names: tuple[str, ...]) -> str | None:
 
 
 def number_of(name: str) -> int | None:
-    """Give the last number in a file's name without its suffix, such as 12 of "frame-000012.color.jpg"; None where it has none."""
+    """Return the last number in a file's name without its suffix, such as 12 of "frame-000012.color.jpg"; None where it has none."""
     found = re.findall(r"\d+", PurePosixPath(name).name.split(".")[0]) or re.findall(r"\d+", PurePosixPath(name).stem)
     return int(found[-1][-MOST_DIGITS:]) if found else None
 

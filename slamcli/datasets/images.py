@@ -60,7 +60,7 @@ class Pixels:
 
     @property
     def size(self) -> tuple[int, int]:
-        """Give (width, height) [px]."""
+        """Return (width, height) [px]."""
         height, width = self.data.shape[:2]
         return (width, height * 2 // 3) if self.encoding in PLANAR else (width, height)
 
@@ -113,7 +113,7 @@ def image_size(data: bytes) -> tuple[int, int] | None:
 
 
 def picture_size(picture: Picture, name: str) -> tuple[int, int]:
-    """Give (width, height) of a picture, from its header where that says it; BadFrame where it is no picture."""
+    """Return (width, height) of a picture, from its header where that says it; BadFrame where it is no picture."""
     if isinstance(picture, Pixels):
         return picture.size
     found = image_size(picture)
@@ -124,7 +124,7 @@ def picture_size(picture: Picture, name: str) -> tuple[int, int]:
 
 
 def decode_grey(picture: Picture, size: tuple[int, int], *, name: str, reduction: int = 1) -> np.ndarray:
-    """Give the grey image, (height // reduction, width // reduction) uint8; `size` is the (width, height) it must have before."""
+    """Return the grey image, (height // reduction, width // reduction) uint8; `size` is the (width, height) it must have before."""
     if isinstance(picture, Pixels):
         return _reduced(_converted(picture, 0, size, name), size, reduction)
     _check_size(picture, size, name)
@@ -138,7 +138,7 @@ def decode_grey(picture: Picture, size: tuple[int, int], *, name: str, reduction
 
 
 def decode_rgb(picture: Picture, size: tuple[int, int], *, name: str, reduction: int = 1) -> np.ndarray:
-    """Give the colour image, (height // reduction, width // reduction, 3) uint8, red first."""
+    """Return the colour image, (height // reduction, width // reduction, 3) uint8, red first."""
     if isinstance(picture, Pixels):
         return _reduced(_converted(picture, 1, size, name), size, reduction)
     _check_size(picture, size, name)
@@ -151,7 +151,7 @@ def decode_rgb(picture: Picture, size: tuple[int, int], *, name: str, reduction:
 
 
 def decode_depth(data: bytes, size: tuple[int, int] | None = None, *, name: str) -> np.ndarray:
-    """Give the raw depth image, (height, width) uint16 or float32; BadFrame for any other pixel type, 8 bits above all.
+    """Return the raw depth image, (height, width) uint16 or float32; BadFrame for any other pixel type, 8 bits above all.
 
     PNG, TIFF and PNM of 16 bits or of floats, EXR, and numpy's .npy without objects.
     """
@@ -169,7 +169,7 @@ def decode_depth(data: bytes, size: tuple[int, int] | None = None, *, name: str)
 
 
 def checked_depth(raw: np.ndarray, size: tuple[int, int] | None = None, *, name: str) -> np.ndarray:
-    """Give depth pixels as (height, width) uint16 or float32; BadFrame where they are of another kind."""
+    """Return depth pixels as (height, width) uint16 or float32; BadFrame where they are of another kind."""
     if raw.ndim == 3 and raw.shape[2] == 1:
         raw = raw[..., 0]
     if raw.ndim != 2:
@@ -217,7 +217,7 @@ def _converted(picture: Pixels, which: int, size: tuple[int, int], name: str) ->
 
 
 def _power(reduction: int) -> int:
-    """Give the largest reduction that JPEG's decoder offers up to this one."""
+    """Return the largest reduction that JPEG's decoder offers up to this one."""
     return max((power for power in REDUCED if power <= reduction), default=1)
 
 

@@ -105,7 +105,7 @@ def read_pairs(path: Path, folder: Folder | None = None) -> PairList:
 
 
 def data_lines(path: Path) -> list[tuple[int, str]]:
-    """Give (line number, text) of the lines that hold data."""
+    """Return (line number, text) of the lines that hold data."""
     lines = enumerate(read_text(path).splitlines(), start=1)
     return [(number, line[:MAX_LINE]) for number, line in lines if line.strip() and not line.lstrip().startswith("#")]
 

@@ -31,19 +31,19 @@ class Dataset(Protocol):
 
     @property
     def stamp(self) -> np.ndarray:
-        """Give the time of each colour frame, (F,) float64 [s], increasing."""
+        """Return the time of each colour frame, (F,) float64 [s], increasing."""
 
     @property
     def depth_stamp(self) -> np.ndarray:
-        """Give the time of the depth image paired with it, (F,) float64 [s], NaN = the frame has none."""
+        """Return the time of the depth image paired with it, (F,) float64 [s], NaN = the frame has none."""
 
     @property
     def camera(self) -> Camera:
-        """Give the intrinsics of the pictures as they are delivered; depth is delivered in their pixels."""
+        """Return the intrinsics of the pictures as they are delivered; depth is delivered in their pixels."""
 
     @property
     def depth_camera(self) -> Camera | None:
-        """Give the intrinsics of the depth camera where its images are registered on reading; None = they are delivered as recorded."""
+        """Return the intrinsics of the depth camera where its images are registered on reading; None = they are delivered as recorded."""
 
     @property
     def warnings(self) -> list[str]:

@@ -46,7 +46,7 @@ class Recorded:
 
 
 def truth_file(path: Path) -> Truth | None:
-    """Give the truth of a TUM trajectory file, whose stamps are of the colour images' clock; None where there is no such file."""
+    """Return the truth of a TUM trajectory file, whose stamps are of the colour images' clock; None where there is no such file."""
     if not path.is_file():
         return None
 
@@ -67,7 +67,7 @@ def poses_by_number(path: Path, files: dict[int, str], numbers: list[int | None]
 
 
 def truth_of_rows(T_wc: np.ndarray) -> Truth:
-    """Give the truth as one pose for each row of colour, (N, 4, 4), not finite = unknown."""
+    """Return the truth as one pose for each row of colour, (N, 4, 4), not finite = unknown."""
 
     def read(clock: Clock) -> Trajectory | None:
         poses = T_wc[clock.row]
@@ -78,12 +78,12 @@ def truth_of_rows(T_wc: np.ndarray) -> Truth:
 
 
 def truth_when_asked(load: Callable[[], np.ndarray]) -> Truth:
-    """Give the truth that `load` reads when somebody asks for it: one pose for each row of colour, (N, 4, 4), not finite = unknown."""
+    """Return the truth that `load` reads when somebody asks for it: one pose for each row of colour, (N, 4, 4), not finite = unknown."""
     return lambda clock: truth_of_rows(load())(clock)
 
 
 def truth_of_columns(rows: np.ndarray) -> Truth:
-    """Give the truth that stands beside the images in one list, (N, 8) stamp tx ty tz qx qy qz qw for each row of colour."""
+    """Return the truth that stands beside the images in one list, (N, 8) stamp tx ty tz qx qy qz qw for each row of colour."""
     return truth_of_rows(se3.from_quaternion(rows[:, 1:4], rows[:, 4:8]))
 
 

@@ -43,7 +43,7 @@ class Recording:
 
     @property
     def depth_camera(self) -> Camera | None:
-        """Give the intrinsics of the depth camera where its images are registered on reading."""
+        """Return the intrinsics of the depth camera where its images are registered on reading."""
         return self.registration.depth_camera if self.registration else None
 
     @cached_property
@@ -89,7 +89,7 @@ class Recording:
         return grey[: step * self.camera.height : step, : step * self.camera.width : step] > 0
 
     def ground_truth(self) -> Trajectory | None:
-        """Give the true camera-to-world poses, None where the recording has none."""
+        """Return the true camera-to-world poses, None where the recording has none."""
         return self.read_ground_truth()
 
     def digest(self) -> str:
@@ -110,5 +110,5 @@ class Recording:
 
 
 def spread(n: int, wanted: int) -> list[int]:
-    """Give up to `wanted` indices below n, evenly spread."""
+    """Return up to `wanted` indices below n, evenly spread."""
     return sorted({int(i) for i in np.linspace(0, n - 1, num=min(n, wanted))}) if n else []

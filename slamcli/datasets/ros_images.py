@@ -46,7 +46,7 @@ class TopicImages:
         return f"{self.path}:{self.names[i]}"
 
     def n_bytes(self, i: int) -> int:
-        """Give the time of recording in the place of a size: both tell one message from another, and this is known without reading."""
+        """Return the time of recording in the place of a size: both tell one message from another, and this is known without reading."""
         return self.topic.messages[i][0]
 
     def read(self, i: int) -> Picture | np.ndarray:

@@ -61,7 +61,7 @@ class Simulation:
     stamps: Path | None = None  # "colour depth" stamps for it
 
     def camera(self) -> Camera:
-        """Give the camera, without distortion."""
+        """Return the camera, without distortion."""
         focal = self.width / 2 / np.tan(np.radians(self.field_of_view) / 2)
         return Camera(self.width, self.height, focal, focal, (self.width - 1) / 2, (self.height - 1) / 2, depth_scale=DEPTH_SCALE)
 

@@ -22,7 +22,7 @@ class Images(Protocol):
         """Name image i for a message, with its folder or file."""
 
     def n_bytes(self, i: int) -> int:
-        """Give the size of image i as stored, -1 where it is missing."""
+        """Return the size of image i as stored, -1 where it is missing."""
 
     def read(self, i: int) -> Picture | np.ndarray:
         """Read image i: a picture, or depth pixels (h, w); BadFrame where it cannot be read."""
@@ -35,7 +35,7 @@ class ImageFiles:
         self.root, self.names = root, names
 
     def where(self, i: int) -> str:
-        """Give the path."""
+        """Return the path."""
         return str(self.root / self.names[i])
 
     def n_bytes(self, i: int) -> int:
@@ -61,7 +61,7 @@ class ConfidentDepth:
         return self._depth.where(i)
 
     def n_bytes(self, i: int) -> int:
-        """Give the size of the depth image."""
+        """Return the size of the depth image."""
         return self._depth.n_bytes(i)
 
     def read(self, i: int) -> np.ndarray:

@@ -49,7 +49,7 @@ class Blobs:
         return f"{self.path}:{self.names[i]}"
 
     def n_bytes(self, i: int) -> int:
-        """Give the size of the blob."""
+        """Return the size of the blob."""
         return int(self._sizes[i])
 
     def read(self, i: int) -> bytes | np.ndarray:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 @contextmanager
 def staged(target: Path) -> Iterator[Path]:
-    """Give a hidden folder beside `target` that becomes it when the block ends well and is removed when not.
+    """Return a hidden folder beside `target` that becomes it when the block ends well and is removed when not.
 
     What an earlier process left behind when it was killed is removed first.
     """

@@ -47,7 +47,7 @@ class VideoFrames:
 
     @property
     def seconds(self) -> np.ndarray:
-        """Give the time of each frame since the beginning of the file, (N,) [s]."""
+        """Return the time of each frame since the beginning of the file, (N,) [s]."""
         return np.array([float(pts * self.time_base) for pts in self.pts])
 
     def where(self, i: int) -> str:
@@ -55,7 +55,7 @@ class VideoFrames:
         return f"{self.path}#{i}"
 
     def n_bytes(self, i: int) -> int:
-        """Give the size of the frame's packet."""
+        """Return the size of the frame's packet."""
         return int(self._sizes[i]) if 0 <= i < len(self._sizes) else -1
 
     def read(self, i: int) -> Pixels | np.ndarray:

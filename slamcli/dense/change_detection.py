@@ -43,7 +43,7 @@ def witnesses(
 
 
 def _vanished(grid: OccupancyMap) -> tuple[np.ndarray, np.ndarray]:
-    """Give doubted cells that lie side by side: their centres (N, 3) [m] and the frame of each one's last hit (N,)."""
+    """Return doubted cells that lie side by side: their centres (N, 3) [m] and the frame of each one's last hit (N,)."""
     cell, last_hit = grid.doubted(MISSES)
     group = _components(cell)
     is_large = np.bincount(group, minlength=1)[group] >= CELLS

@@ -62,7 +62,7 @@ def _samples(frames: Iterable[tuple[Surface, np.ndarray, np.ndarray]]) -> tuple[
 def fit_log_gains(of_frame: np.ndarray, of_voxel: np.ndarray, log_colour: np.ndarray, *, n_frames: int) -> np.ndarray:
     """Fit the logarithms (K, 3) of gains to samples (N,) of frames in voxels with the logarithms of their colours (N, 3).
 
-    Minimises sum w (log_colour + gain - colour of the voxel)^2, Tukey's weights, plus a weak prior that keeps frames without overlap at 1.
+    Minimizes sum w (log_colour + gain - colour of the voxel)^2, Tukey's weights, plus a weak prior that keeps frames without overlap at 1.
     """
     n_voxels = int(of_voxel.max(initial=-1)) + 1
     gain = np.zeros((n_frames, log_colour.shape[1]))

@@ -32,7 +32,7 @@ class Scan(NamedTuple):
 
 
 def log_odds(probability: float) -> np.float32:
-    """Give ln(p / (1 - p)); (12) of Zhao et al."""
+    """Return ln(p / (1 - p)); (12) of Zhao et al."""
     return np.float32(np.log(probability / (1.0 - probability)))
 
 
@@ -53,20 +53,20 @@ class OccupancyMap:
 
     @property
     def looks(self) -> int:
-        """Give how many misses make the surest cell free."""
+        """Return how many misses make the surest cell free."""
         miss, _, lowest, highest = self._update
         return int(np.ceil((highest - np.maximum(lowest, 0.0)) / -miss))
 
-    def insert(self, x_w: np.ndarray, origin: np.ndarray, *, max_range: float, discretise: bool = False, frame: int = 0) -> None:
+    def insert(self, x_w: np.ndarray, origin: np.ndarray, *, max_range: float, discretize: bool = False, frame: int = 0) -> None:
         """Insert one scan.
 
         x_w : (N, 3) end points [m]; one that is not finite is skipped
         origin : (3,) where the rays start [m]
         max_range : farther points only free the space up to this range [m]; 0 = no limit
-        discretise : cast one ray per end cell, to its centre, instead of one per point
+        discretize : cast one ray per end cell, to its centre, instead of one per point
         frame : number of the scan, for `doubted`
         """
-        marked = mark_scan(x_w, origin, max_range=max_range, resolution=self.resolution, discretise=discretise)
+        marked = mark_scan(x_w, origin, max_range=max_range, resolution=self.resolution, discretize=discretize)
         if marked is None:
             return
         marks, lower = marked
@@ -89,11 +89,11 @@ class OccupancyMap:
         return cell, columns["last_hit"][block, local]
 
     def centre(self, cell: np.ndarray) -> np.ndarray:
-        """Give the centres (N, 3) [m] of cells (N, 3)."""
+        """Return the centres (N, 3) [m] of cells (N, 3)."""
         return (cell - CENTRE + 0.5) * self.resolution
 
     def leaves(self) -> Octree:
-        """Give the known cells as an octree that is not pruned."""
+        """Return the known cells as an octree that is not pruned."""
         n = self._blocks.n
         order = np.argsort(self._blocks.row_key[:n])
         value = self._blocks.columns["log_odds"][:n][order]
@@ -112,7 +112,7 @@ class Accuracy:
 
     @property
     def share(self) -> float:
-        """Give the share of known cells whose state is the scan's, NaN when none is known."""
+        """Return the share of known cells whose state is the scan's, NaN when none is known."""
         return self.correct / (self.correct + self.wrong) if self.correct + self.wrong else np.nan
 
 

@@ -95,7 +95,7 @@ def _mean_distances(
 
 @kernel
 def _gap(x, side, reach):
-    """Give the distance along one axis from x, measured from the cell's lower face, to the cell beside it on that side."""
+    """Return the distance along one axis from x, measured from the cell's lower face, to the cell beside it on that side."""
     if side < 0:
         return x
     return reach - x if side > 0 else np.float32(0.0)

@@ -20,7 +20,7 @@ ROUNDING = 1e-9  # relative; far above what some hundred additions of float64 ca
 
 
 def mark_scan(
-    x_w: np.ndarray, origin: np.ndarray, *, max_range: float, resolution: float, discretise: bool = False
+    x_w: np.ndarray, origin: np.ndarray, *, max_range: float, resolution: float, discretize: bool = False
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """Find the cells that a scan's rays pass and end in; arguments as `occupancy.OccupancyMap.insert`.
 
@@ -29,7 +29,7 @@ def mark_scan(
     """
     x_w = np.ascontiguousarray(x_w, dtype=np.float32).reshape(-1, 3)
     origin = np.ascontiguousarray(origin, dtype=np.float32)
-    if discretise:
+    if discretize:
         x_w = _cell_centres(x_w, resolution)
     end, end_cell, is_hit = np.empty_like(x_w), np.empty(x_w.shape, dtype=np.int64), np.empty(len(x_w), dtype=np.bool_)
     box = np.empty((2, 3), dtype=np.int64)

@@ -29,7 +29,7 @@ class Mesh:
     triangle: np.ndarray  # (M, 3) int32, vertex rows, counter-clockwise seen from outside
 
     def moved(self, T_ab: np.ndarray) -> "Mesh":
-        """Give the mesh of frame b in frame a."""
+        """Return the mesh of frame b in frame a."""
         xyz = se3.transform(T_ab, self.xyz.astype(np.float64)).astype(np.float32)
         return Mesh(xyz, self.rgb, (self.normal @ T_ab[:3, :3].T).astype(np.float32), self.triangle)
 

@@ -29,7 +29,7 @@ class Cloud:
         return len(self.xyz)
 
     def moved(self, T_ab: np.ndarray) -> "Cloud":
-        """Give the cloud of frame b in frame a; the order stays."""
+        """Return the cloud of frame b in frame a; the order stays."""
         xyz = se3.transform(T_ab, self.xyz.astype(np.float64)).astype(np.float32)
         return Cloud(xyz, self.rgb, (self.normal @ T_ab[:3, :3].T).astype(np.float32))
 
@@ -62,7 +62,7 @@ class VoxelCloud:
         )
 
     def cloud(self, *, min_points: int = 1, neighbours: int = 0, max_deviation: float = np.inf) -> Cloud:
-        """Give the voxels with at least `min_points` readings, in Morton order.
+        """Return the voxels with at least `min_points` readings, in Morton order.
 
         neighbours, max_deviation : points whose mean distance to so many neighbours exceeds the mean over the cloud by more than so
             many standard deviations are dropped; 0 neighbours keep all

@@ -62,7 +62,7 @@ def _is_behind_outline(depth: f4[:, ::1], at: i8[:, ::1], reach: i8, least: f4, 
 
 
 def inverse_depth_slope(depth: np.ndarray, xy: np.ndarray) -> np.ndarray:
-    """Give by how much the inverse of depth (H, W) [m] grows per pixel to the right and downwards at raw points xy (N, 2), (N, 2) [1/m/px].
+    """Return by how much the inverse of depth (H, W) [m] grows per pixel to the right and downwards at raw points xy (N, 2), (N, 2) [1/m/px].
 
     A plane's inverse depth is linear in pixels, and what lies opposite each other around a point shows its slope; pairs over which it
     bends are of two surfaces and left out. Level where no pair is left.

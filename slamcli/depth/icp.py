@@ -1,7 +1,7 @@
 """Alignment on shape: where the picture has no texture, the surfaces that two depth images show say how the camera moved.
 
 Depth images are made coarse, as shape needs no fine detail and the noise of single readings averages out. Points of one meet the point of
-the other that they project to, and their distance along its normal is minimised (Y. Chen, G. Medioni, Object Modelling by Registration of
+the other that they project to, and their distance along its normal is minimized (Y. Chen, G. Medioni, Object Modelling by Registration of
 Multiple Range Images, 1992, doi:10.1016/0262-8856(92)90066-C; projective association: G. Blais, M. Levine, PAMI 1995,
 doi:10.1109/34.400574).
 
@@ -36,7 +36,7 @@ DETERMINED_SIGMA = 0.01  # [m] a direction known to this at the mean depth is de
 
 
 @dataclass(frozen=True)
-class Relief:
+class OrientedPoints:
     """The surface that a coarse depth image shows, as points with normals."""
 
     xyz: np.ndarray  # (N, 3) float32 [m], camera frame
@@ -62,7 +62,7 @@ class Alignment:
 
 
 def _blocks(columns: int) -> tuple[int, int, int]:
-    """Give the side [px] of the blocks that stand for one coarse pixel, and the first row and the width of the part that is averaged.
+    """Return the side [px] of the blocks that stand for one coarse pixel, and the first row and the width of the part that is averaged.
 
     Readings err together with their neighbours: the middle of a block tells nearly as much as all of it, in a third of the time.
     """
@@ -81,12 +81,12 @@ def coarse(depth: np.ndarray) -> np.ndarray:
 
 
 def coarse_shape(camera: Camera) -> tuple[int, int]:
-    """Give the rows and columns of the camera's coarse depth images."""
+    """Return the rows and columns of the camera's coarse depth images."""
     side, _, _ = _blocks(camera.width)
     return camera.height // side, camera.width // side
 
 
-def relief(coarse_depth: np.ndarray, camera: Camera, sensor: SensorConfig, *, given: Camera | None = None) -> Relief:
+def relief(coarse_depth: np.ndarray, camera: Camera, sensor: SensorConfig, *, given: Camera | None = None) -> OrientedPoints:
     """Find the surface in a coarse depth image of `camera`.
 
     given : the calibration under which the depth was read, if it was another one
@@ -99,7 +99,7 @@ def relief(coarse_depth: np.ndarray, camera: Camera, sensor: SensorConfig, *, gi
     row = np.full(depth.size + 1, -1, dtype=np.int32)
     row[seen.pixel] = np.arange(len(seen.pixel), dtype=np.int32)
     sigma = noise_model.depth_sigma(seen.xyz_c[:, 2], base=CLEANING.noise_base, quadratic=CLEANING.noise_quadratic)
-    return Relief(
+    return OrientedPoints(
         xyz=seen.xyz_c,
         normal=seen.normal_c,
         variance=np.square(sigma).astype(np.float32),
@@ -110,7 +110,7 @@ def relief(coarse_depth: np.ndarray, camera: Camera, sensor: SensorConfig, *, gi
 
 @lru_cache(maxsize=4)
 def coarse_camera(camera: Camera) -> tuple[Camera, np.ndarray]:
-    """Give the camera of the coarse images, and which of its raw pixels each pixel of it without distortion shows (h, w), last = none."""
+    """Return the camera of the coarse images, and which of its raw pixels each pixel of it without distortion shows (h, w), last = none."""
     side, first, width = _blocks(camera.width)
     middle = first + (width - 1) / 2
     values = camera.to_dict() | {"width": camera.width // side, "height": camera.height // side}
@@ -123,7 +123,9 @@ def coarse_camera(camera: Camera) -> tuple[Camera, np.ndarray]:
     return small, np.where(inside, raw[..., 1] * small.width + raw[..., 0], small.width * small.height)
 
 
-def align(T_ij: np.ndarray, source: Relief, target: Relief, *, known: tuple[np.ndarray, np.ndarray] | None = None) -> Alignment:
+def align(
+    T_ij: np.ndarray, source: OrientedPoints, target: OrientedPoints, *, known: tuple[np.ndarray, np.ndarray] | None = None
+) -> Alignment:
     """Move the points of `source` (j) onto the surface of `target` (i), from the start T_ij.
 
     known : what else is known of T_ij: a pose (4, 4) and the information (6, 6) of its left twist, such as landmarks give
@@ -139,7 +141,7 @@ def align(T_ij: np.ndarray, source: Relief, target: Relief, *, known: tuple[np.n
     met, agree, cost = kernels.align(T, *points, *surface, SCHEDULE, MIN_COSINE, HUBER_CHI2, READINGS_AS_ONE, H_known, b_known, H, b)
     factor = READINGS_AS_ONE * max(cost / max(agree, 1), kernels.LEAST_VARIANCE_FACTOR)
     return Alignment(
-        T_ij=se3.orthonormalise(T),
+        T_ij=se3.orthonormalize(T),
         information=(np.triu(H) + np.triu(H, 1).T) / factor,
         overlap=agree / max(len(source), 1),
         agreement=agree / max(met, 1),
@@ -149,7 +151,7 @@ def align(T_ij: np.ndarray, source: Relief, target: Relief, *, known: tuple[np.n
 
 
 def weakest_sigmas(information: np.ndarray, depth: float) -> np.ndarray:
-    """Give the standard deviations (6,) [m] along the principal directions of a motion, the worst first.
+    """Return the standard deviations (6,) [m] along the principal directions of a motion, the worst first.
 
     information : (6, 6) of a twist [1/m^2, 1/rad^2]; depth : [m] of what is seen, where a turn by 1 rad moves things as far
     """

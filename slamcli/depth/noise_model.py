@@ -4,12 +4,12 @@ import numpy as np
 
 
 def pixel_sigma(octave: np.ndarray, *, pixel_noise: float, octave_scale: float) -> np.ndarray:
-    """Give the standard deviation of key points [px]: it grows with the size of the patch they were found in."""
+    """Return the standard deviation of key points [px]: it grows with the size of the patch they were found in."""
     return pixel_noise * np.power(octave_scale, np.asarray(octave, dtype=np.float64))
 
 
 def depth_sigma(depth: np.ndarray, *, base: float, quadratic: float) -> np.ndarray:
-    """Give the standard deviation of a structured-light depth reading [m], NaN where there is none.
+    """Return the standard deviation of a structured-light depth reading [m], NaN where there is none.
 
     C. V. Nguyen, S. Izadi, D. Lovell, Modeling Kinect sensor noise, 3DIMPVT 2012, equation (2): 0.0012 + 0.0019 (z - 0.4)^2.
     """

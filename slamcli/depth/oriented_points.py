@@ -67,7 +67,7 @@ def surface(
 
 @lru_cache(maxsize=4)
 def _rays(camera: Camera) -> np.ndarray:
-    """Give the camera's rays, worked out once for equal cameras: every stage has an object of its own."""
+    """Return the camera's rays, worked out once for equal cameras: every stage has an object of its own."""
     return camera.rays
 
 

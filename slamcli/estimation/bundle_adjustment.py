@@ -49,14 +49,14 @@ class BundleResult:
 
 
 class PoseCovariance:
-    """The uncertainty of key-frame poses with the landmarks marginalised; (6, 6) blocks of left twists of T_cw, 0 where fixed."""
+    """The uncertainty of key-frame poses with the landmarks marginalized; (6, 6) blocks of left twists of T_cw, 0 where fixed."""
 
     def __init__(self, factor: Factor, place: np.ndarray, T_cw: np.ndarray) -> None:
         self._factor, self._place, self._T_cw = factor, place, T_cw
         self._n = int((place >= 0).sum())
 
     def joint(self, kfs: np.ndarray | list[int]) -> np.ndarray:
-        """Give the joint covariance (6 m, 6 m) [m^2, rad^2] of m key frames."""
+        """Return the joint covariance (6 m, 6 m) [m^2, rad^2] of m key frames."""
         columns = np.zeros((6 * self._n, 6 * len(kfs)))
         place = self._place[np.asarray(kfs, dtype=np.int64)]
         for m in np.flatnonzero(place >= 0):
@@ -66,7 +66,7 @@ class PoseCovariance:
         return 0.5 * (out + out.T)
 
     def relative(self, kf_i: int, kf_j: int) -> np.ndarray:
-        """Give the covariance (6, 6) of the left twist of T_ij, x_i = T_ij x_j; its inverse is the information of a pose-graph edge."""
+        """Return the covariance (6, 6) of the left twist of T_ij, x_i = T_ij x_j; its inverse is the information of a pose-graph edge."""
         T_ij = self._T_cw[kf_i] @ se3.inverse(self._T_cw[kf_j])
         J = np.hstack([np.eye(6), -se3.adjoint(T_ij)])
         return J @ self.joint([kf_i, kf_j]) @ J.T
@@ -93,7 +93,7 @@ def adjust(
     T_cw : (K, 4, 4); x_w : (L, 3) [m]; is_fixed : (K,) bool, key frames that stay
     edges : relative poses of key frames that were measured besides
 
-    Minimises the sum over observations and edges of Huber's function of chi2, for observations = |xy - pi(x)|^2 / sigma_px^2 + (depth - z)^2 / sigma_z^2, which is
+    Minimizes the sum over observations and edges of Huber's function of chi2, for observations = |xy - pi(x)|^2 / sigma_px^2 + (depth - z)^2 / sigma_z^2, which is
     chi2 up to its 95 % quantile and then grows like its root. With `outlier_iterations`, observations beyond the quantile after
     `max_iterations` are dropped and that many iterations follow without them. An iteration ends the adjustment when it lowers the cost
     by less than the share `tolerance`. A landmark seen once is adjusted with its depth; with one bearing alone it bears on nothing.
@@ -102,11 +102,11 @@ def adjust(
     problem = Problem(T_cw, x_w, seen, camera, is_fixed, edges)
     quantiles = np.array([chi2_px, chi2_depth], dtype=np.float64)
     limits = quantiles if robust else np.array([np.inf, np.inf])
-    T, x, cost, iterations, is_converged = _minimise(problem, problem.T, problem.x, limits, max_iterations, tolerance)
+    T, x, cost, iterations, is_converged = _minimize(problem, problem.T, problem.x, limits, max_iterations, tolerance)
     in_use = problem.measured[:, 3].copy()
     if outlier_iterations:
         problem.measured[problem.chi2(T, x) > problem.threshold(quantiles), 3] = 0.0
-        T, x, more, extra, is_converged = _minimise(problem, T, x, limits, outlier_iterations, tolerance)
+        T, x, more, extra, is_converged = _minimize(problem, T, x, limits, outlier_iterations, tolerance)
         cost, iterations = cost + more, iterations + extra
     covariance = problem.covariance(T, x, limits) if with_covariance else None
     problem.measured[:, 3] = in_use
@@ -117,17 +117,17 @@ def adjust(
     return BundleResult(T, x, cost, chi2, is_inlier, iterations, is_converged, covariance)
 
 
-def _minimise(
+def _minimize(
     problem: "Problem", T: np.ndarray, x: np.ndarray, limits: np.ndarray, max_iterations: int, tolerance: float
 ) -> tuple[np.ndarray, np.ndarray, list[float], int, bool]:
     """Run Levenberg-Marquardt; the damping follows H. Nielsen, Damping Parameter in Marquardt's Method, IMM-REP-1999-05."""
     T, x, T_new, x_new = T.copy(), x.copy(), np.empty_like(T), np.empty_like(x)
     cost = [problem.cost(T, x, limits)]
-    damping, growth, is_linearised = DAMPING_START, 2.0, False
+    damping, growth, is_linearized = DAMPING_START, 2.0, False
     for iteration in range(1, max_iterations + 1):
-        if not is_linearised:
+        if not is_linearized:
             problem.linearize(T, x, limits)
-            is_linearised = True
+            is_linearized = True
         expected = problem.step(T, x, damping, T_new, x_new)
         if expected <= 0.1 * tolerance * cost[-1]:
             return T, x, cost, iteration, True
@@ -139,7 +139,7 @@ def _minimise(
             cost.append(new_cost)
             if is_converged:
                 return T, x, cost, iteration, True
-            damping, growth, is_linearised = max(DAMPING_MIN, damping * max(0.1, 1.0 - (2.0 * gain - 1.0) ** 3)), 2.0, False
+            damping, growth, is_linearized = max(DAMPING_MIN, damping * max(0.1, 1.0 - (2.0 * gain - 1.0) ** 3)), 2.0, False
         else:
             damping, growth = damping * growth, 2.0 * growth
             if damping > DAMPING_MAX:
@@ -187,7 +187,7 @@ class Problem:
         return out
 
     def threshold(self, quantiles: np.ndarray) -> np.ndarray:
-        """Give the chi2 quantile (O,) that belongs to each observation's number of residuals."""
+        """Return the chi2 quantile (O,) that belongs to each observation's number of residuals."""
         return np.where(self.measured[:, 4] > 0.0, quantiles[1], quantiles[0])
 
     def _evaluate(self, T: np.ndarray, x: np.ndarray, limits: np.ndarray) -> tuple[float, np.ndarray]:
@@ -195,11 +195,11 @@ class Problem:
         return kernels.evaluate(T, x, self.obs_kf, self.offset, self.measured, self.camera, limits, chi2), chi2
 
     def cost(self, T: np.ndarray, x: np.ndarray, limits: np.ndarray) -> float:
-        """Give the sum of Huber's costs; limits : (2,) chi2 from which it grows like the root, without and with depth."""
+        """Return the sum of Huber's costs; limits : (2,) chi2 from which it grows like the root, without and with depth."""
         return self._evaluate(T, x, limits)[0] + self.edge_terms.cost(T, np.isfinite(limits).all())
 
     def chi2(self, T: np.ndarray, x: np.ndarray) -> np.ndarray:
-        """Give chi2 (O,), inf where switched off or behind the camera."""
+        """Return chi2 (O,), inf where switched off or behind the camera."""
         chi2 = self._evaluate(T, x, np.array([np.inf, np.inf]))[1]
         return np.where((self.measured[:, 3] == 0.0) | (chi2 >= kernels.CHI2_BEHIND), np.inf, chi2)
 
@@ -231,7 +231,7 @@ class Problem:
     def step(self, T: np.ndarray, x: np.ndarray, damping: float, T_new: np.ndarray, x_new: np.ndarray) -> float:
         """Write poses and landmarks after one damped step; return the decrease of the cost to be expected, NaN where none was found."""
         self.eliminate(damping, self.hold)
-        factor = self.system.factorise()
+        factor = self.system.factorize()
         if factor is None:
             return np.nan
         dx = factor.solve(self.rhs.ravel()).reshape(-1, 6)
@@ -239,11 +239,11 @@ class Problem:
         return kernels.step(T, x, *blocks, damping, self.hold, dx, T_new, x_new)
 
     def covariance(self, T: np.ndarray, x: np.ndarray, limits: np.ndarray) -> PoseCovariance | None:
-        """Factorise the undamped system at the result; None where the poses are not determined."""
+        """Factorize the undamped system at the result; None where the poses are not determined."""
         self.linearize(T, x, limits)
-        # The least damping regularises landmarks with one bearing, which bear on nothing, and is lost in the digits of all others.
+        # The least damping regularizes landmarks with one bearing, which bear on nothing, and is lost in the digits of all others.
         self.eliminate(DAMPING_MIN, np.zeros_like(self.hold))
-        factor = self.system.factorise()
+        factor = self.system.factorize()
         return None if factor is None else PoseCovariance(factor, self.place, T)
 
 

@@ -113,7 +113,7 @@ def refine_pose(
     nothing changes. Observations with a value that is not finite are outliers. Huber's kernel acts on an observation as a whole, from
     the same chi2 on.
     """
-    start, is_inlier = se3.orthonormalise(T_cw), np.empty(len(x_w), dtype=np.bool_)
+    start, is_inlier = se3.orthonormalize(T_cw), np.empty(len(x_w), dtype=np.bool_)
     measured = (_cast(xy), _cast(depth), _cast(sigma_px), _cast(sigma_z))
     T, H, cost, total, rms = kernels.refine(
         start, _points(x_w), *measured, _intrinsics(camera), chi2_px, chi2_depth, huber, rounds, iterations, is_inlier
@@ -153,7 +153,7 @@ def _best_of_four(solutions: np.ndarray, x: np.ndarray, ray: np.ndarray) -> np.n
 
 def _ransac_estimate(T: np.ndarray, is_inlier: np.ndarray, rounds: int, rms: float) -> PoseEstimate:
     return PoseEstimate(
-        T_cw=se3.orthonormalise(np.vstack([T, [0.0, 0.0, 0.0, 1.0]])),
+        T_cw=se3.orthonormalize(np.vstack([T, [0.0, 0.0, 0.0, 1.0]])),
         is_inlier=is_inlier,
         n_inliers=int(is_inlier.sum()),
         information=np.zeros((6, 6)),
@@ -163,7 +163,7 @@ def _ransac_estimate(T: np.ndarray, is_inlier: np.ndarray, rounds: int, rms: flo
 
 
 def _rms(T: np.ndarray, x: np.ndarray, ray: np.ndarray, camera: Camera, is_inlier: np.ndarray) -> float:
-    """Give the root mean square reprojection error [px] of the inliers, NaN without any."""
+    """Return the root mean square reprojection error [px] of the inliers, NaN without any."""
     if not is_inlier.any():
         return float("nan")
     x_c = x @ T[:3, :3].T + T[:3, 3]

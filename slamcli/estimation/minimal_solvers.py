@@ -64,7 +64,7 @@ def _distances(laws: np.ndarray) -> np.ndarray:
 
 
 def _real_root(b: np.ndarray, c: np.ndarray, d: np.ndarray) -> np.ndarray:
-    """Give a real root of x^3 + b x^2 + c x + d: Cardano's where there is one, the largest where there are three; then Newton's method."""
+    """Return a real root of x^3 + b x^2 + c x + d: Cardano's where there is one, the largest where there are three; then Newton's method."""
     p, q = c - b * b / 3.0, b * (2.0 * b * b / 27.0 - c / 3.0) + d
     discriminant = 0.25 * q * q + p * p * p / 27.0
     u = np.cbrt(-0.5 * q - np.copysign(np.sqrt(np.maximum(discriminant, 0.0)), q))
@@ -97,7 +97,7 @@ def _polish(distances: np.ndarray, laws: np.ndarray) -> np.ndarray:
 
 
 def _align(x: np.ndarray, x_c: np.ndarray) -> np.ndarray:
-    """Give [R | t] (M, 4, 3, 4) that takes congruent triangles x (M, 3, 3) to x_c (M, 4, 3, 3): edges to edges, normal to normal."""
+    """Return [R | t] (M, 4, 3, 4) that takes congruent triangles x (M, 3, 3) to x_c (M, 4, 3, 3): edges to edges, normal to normal."""
     frame = _edges_and_normal(x)
     is_triangle = np.abs(np.linalg.det(frame)) > 0.0
     inverse = np.linalg.inv(np.where(is_triangle[:, None, None], frame, np.eye(3)))
@@ -136,7 +136,7 @@ def rigid3(x_a: np.ndarray, x_b: np.ndarray) -> np.ndarray:
 
 
 def _plane_frame(x: np.ndarray) -> np.ndarray:
-    """Give orthonormal columns (M, 3, 3): along the first edge, across it within the plane, and the normal; NaN for points on a line."""
+    """Return orthonormal columns (M, 3, 3): along the first edge, across it within the plane, and the normal; NaN for points on a line."""
     a, b = x[:, 1] - x[:, 0], x[:, 2] - x[:, 0]
     normal = np.cross(a, b)
     length, area = np.linalg.norm(a, axis=1), np.linalg.norm(normal, axis=1)

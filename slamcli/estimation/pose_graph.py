@@ -82,7 +82,7 @@ def optimize(
 
 
 def share_of_information(edge_kf: np.ndarray, information: np.ndarray, is_trusted: np.ndarray) -> np.ndarray:
-    """Give the share (E,) of its information that each edge may claim when trusted edges repeat each other, 1 for other edges.
+    """Return the share (E,) of its information that each edge may claim when trusted edges repeat each other, 1 for other edges.
 
     Stretch the chain of key frames evenly: an edge of weight w over s steps is stretched s times as far as one step and so resists, per
     step, like w s single edges. Over every cut between neighbours, all edges together may resist like one edge of the largest weight.
@@ -147,7 +147,7 @@ def _snoop(graph: Graph, is_robust: np.ndarray, is_kept: np.ndarray, limit: floa
 
 
 def _claims(ends: np.ndarray) -> list[np.ndarray]:
-    """Give the sets of robust edges (E, 2) that are tested together: each alone, and each group that claims one revisit."""
+    """Return the sets of robust edges (E, 2) that are tested together: each alone, and each group that claims one revisit."""
     ends = np.sort(ends, axis=1)
     near = (np.abs(ends[:, None] - ends[None, :]) <= GROUP_SPAN).all(axis=2)
     _, label = connected_components(near, directed=False)
@@ -158,7 +158,7 @@ def _claims(ends: np.ndarray) -> list[np.ndarray]:
 def _gain(
     residual: np.ndarray, information: np.ndarray, covariance: np.ndarray, members: np.ndarray, kept: np.ndarray, limit: float
 ) -> float:
-    """Give by how much the truncated cost falls when a set of edges changes sides, to first order; -inf for a set on both sides.
+    """Return by how much the truncated cost falls when a set of edges changes sides, to first order; -inf for a set on both sides.
 
     With the residual r of the set, the covariance C of its measurements and P of the graph's prediction, the cost of graph and set
     falls by r^T (C - P)^-1 r when the set is dropped, and rises by r^T (C + P)^-1 r when it is taken in.

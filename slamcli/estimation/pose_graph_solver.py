@@ -42,7 +42,7 @@ class Graph:
             self._edges.append(edge)
 
     def run(self, iterations: int, weight: np.ndarray | None = None) -> int:
-        """Minimise under weights (E,); return the number of iterations, at most so many."""
+        """Minimize under weights (E,); return the number of iterations, at most so many."""
         import g2opy
 
         weight = np.ones(len(self._edges)) if weight is None else np.array(weight, dtype=np.float64)
@@ -86,17 +86,17 @@ class Graph:
         return self._optimizer.active_chi2()
 
     def residual(self) -> np.ndarray:
-        """Give e (E, 6) = log(T_iw T_wj T_ij^-1)."""
+        """Return e (E, 6) = log(T_iw T_wj T_ij^-1)."""
         i, j = self.edge_kf.T
         return se3.log(se3.inverse(self.T_wk[i]) @ self.T_wk[j] @ se3.inverse(self.edge_T_ij))
 
     def chi2(self) -> np.ndarray:
-        """Give e^T Omega e (E,)."""
+        """Return e^T Omega e (E,)."""
         e = self.residual()
         return np.einsum("ei,eij,ej->e", e, self.information, e)
 
     def posterior(self, is_kept: np.ndarray) -> "Posterior":
-        """Factorise the information that the edges kept give."""
+        """Factorize the information that the edges kept give."""
         return Posterior(self, is_kept)
 
 
@@ -111,9 +111,9 @@ class Posterior:
         self._column = place[graph.edge_kf]
         self._J = (np.broadcast_to(np.eye(6), (len(i), 6, 6)), -se3.adjoint(se3.inverse(graph.T_wk[i]) @ graph.T_wk[j]))
         self._n = 6 * int((~graph.is_fixed).sum())
-        self._factor = self._factorise(graph.information, is_kept)
+        self._factor = self._factorize(graph.information, is_kept)
 
-    def _factorise(self, information: np.ndarray, is_kept: np.ndarray) -> SuperLU:
+    def _factorize(self, information: np.ndarray, is_kept: np.ndarray) -> SuperLU:
         rows, columns, values = [], [], []
         for a in range(2):
             for b in range(2):
@@ -131,7 +131,7 @@ class Posterior:
         return splu(H, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
 
     def covariance(self, edges: np.ndarray) -> np.ndarray:
-        """Give the joint covariance (6 m, 6 m) of what the graph predicts for the relative poses of m edges."""
+        """Return the joint covariance (6 m, 6 m) of what the graph predicts for the relative poses of m edges."""
         J = self._rows(edges)
         out = np.empty((J.shape[0], J.shape[0]))
         for first in range(0, len(out), COLUMNS_AT_ONCE):
@@ -140,7 +140,7 @@ class Posterior:
         return out
 
     def _rows(self, edges: np.ndarray) -> csr_array:
-        """Give the derivatives (6 m, n) of the relative poses of m edges."""
+        """Return the derivatives (6 m, n) of the relative poses of m edges."""
         rows, columns, values = [], [], []
         for side in range(2):
             use = self._column[edges, side] >= 0

@@ -1,7 +1,7 @@
 """The reduced camera system of bundle adjustment: symmetric, 6 x 6 blocks, one block row per free key frame.
 
 Blocks exist where two key frames share a landmark or an edge. Key frames are put in an order in which those that share landmarks stand close, and
-the system is factorised as a band, or as a dense matrix where the band is wide. SuperLU took four to five times as long as the band, even
+the system is factorized as a band, or as a dense matrix where the band is wide. SuperLU took four to five times as long as the band, even
 for 1500 key frames in a band of 600. What would not fit into memory is solved by conjugate gradients, which need the blocks alone.
 """
 
@@ -19,7 +19,7 @@ DIRECT_UP_TO = 80_000_000  # numbers in a factor: 640 MB, 1490 key frames that a
 
 
 class Factor(Protocol):
-    """A factorised system."""
+    """A factorized system."""
 
     def solve(self, rhs: np.ndarray) -> np.ndarray:
         """Solve for right-hand sides (6 n,) or (6 n, M)."""
@@ -76,8 +76,8 @@ class ReducedSystem:
         size = 6 * self.n * (self.bandwidth + 1 if form == "band" else 6 * self.n)
         return form if size <= DIRECT_UP_TO else "iterative"
 
-    def factorise(self) -> Factor | None:
-        """Factorise what `blocks` holds; None where it is not positive definite."""
+    def factorize(self) -> Factor | None:
+        """Factorize what `blocks` holds; None where it is not positive definite."""
         if self.form == "empty":
             return _EmptyFactor()
         if self.form == "iterative":
@@ -95,7 +95,7 @@ class ReducedSystem:
         return matrix.reshape(6 * self.n, 6 * self.n)
 
     def _band(self) -> np.ndarray:
-        """Give (6 n, bandwidth + 1), entry (row, column) of the system at (row, column - row)."""
+        """Return (6 n, bandwidth + 1), entry (row, column) of the system at (row, column - row)."""
         flat = np.zeros(6 * self.n * (self.bandwidth + 1))
         for i in range(6):
             for j in range(6):

@@ -28,7 +28,7 @@ NO_EDGES = Edges(np.empty((0, 2), dtype=np.int64), np.empty((0, 4, 4)), np.empty
 
 
 def residuals(edges: Edges, T_cw: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Give e (E, 6) and the relative poses T_iw T_wj (E, 4, 4) that the key frames have now."""
+    """Return e (E, 6) and the relative poses T_iw T_wj (E, 4, 4) that the key frames have now."""
     T_ij = T_cw[edges.kf[:, 0]] @ se3.inverse(T_cw[edges.kf[:, 1]])
     return se3.log(T_ij @ se3.inverse(edges.T_ij)), T_ij
 
@@ -47,7 +47,7 @@ class EdgeTerms:
         self._off_diagonal = np.zeros((len(self._joint), 6, 6))
 
     def cost(self, T_cw: np.ndarray, robust: bool) -> float:
-        """Give the sum over the edges of Huber's cost, or of chi2."""
+        """Return the sum over the edges of Huber's cost, or of chi2."""
         if len(self._edges) == 0:
             return 0.0
         chi2 = self._chi2(residuals(self._edges, T_cw)[0])
@@ -81,7 +81,7 @@ class EdgeTerms:
 
 
 def _inverse_left_jacobian(e: np.ndarray) -> np.ndarray:
-    """Give the inverse left Jacobian (E, 6, 6) of SE(3) at e (E, 6), to the second order: edges that fit have small residuals.
+    """Return the inverse left Jacobian (E, 6, 6) of SE(3) at e (E, 6), to the second order: edges that fit have small residuals.
 
     T. Barfoot, State Estimation for Robotics, 2017, equation (7.98), with Bernoulli numbers 1, -1/2, 1/6.
     """

@@ -44,7 +44,7 @@ def estimate(problem: Problem, columns: np.ndarray, *, prior: np.ndarray, prior_
         shifted[:, :3] += columns[:, :, g]
         rhs, b = _gradient(problem, shifted)
         reduced[g], lifted[g] = rhs - rhs_0, b - b_0
-    factor = problem.system.factorise()
+    factor = problem.system.factorize()
     if factor is None:
         return None
     solved = factor.solve(np.ascontiguousarray(np.concatenate([reduced, rhs_0[None]]).T)).T

@@ -66,7 +66,7 @@ def footprint(solid: dict[str, Any], xy: np.ndarray, low: float, high: float) ->
 
 
 def cast(scene: Scene, origin: np.ndarray, ray: np.ndarray) -> np.ndarray:
-    """Give the multiple of each ray (N, 3) from `origin` (3,) at which it meets a wall, floor, ceiling or solid."""
+    """Return the multiple of each ray (N, 3) from `origin` (3,) at which it meets a wall, floor, ceiling or solid."""
     with np.errstate(divide="ignore", invalid="ignore"):
         distance = _through_slabs(origin, ray, scene.low, scene.high)[1]
         for solid in scene.solids:
@@ -97,7 +97,7 @@ def _through_cylinder(start: np.ndarray, ray: np.ndarray, radius: float, height:
 
 
 def exact_points(scene: Scene, depth: np.ndarray, T_sk: np.ndarray, camera: Camera, *, max_range: float, stride: int = 4) -> np.ndarray:
-    """Give the points (N, 3) that every `stride`-th pixel with a reading up to max_range [m] truly showed."""
+    """Return the points (N, 3) that every `stride`-th pixel with a reading up to max_range [m] truly showed."""
     seen = depth[::stride, ::stride] <= max_range
     rays = camera.rays[::stride, ::stride][seen].astype(np.float64)
     ray = np.column_stack([rays, np.ones(len(rays))]) @ T_sk[:3, :3].T
@@ -121,7 +121,7 @@ class GridScore:
     special: dict[str, dict[str, int]]  # per special box: cells on it, occupied, free, unknown; outline cells seen, of these occupied
 
     def to_dict(self) -> dict[str, Any]:
-        """Give the fields for JSON."""
+        """Return the fields for JSON."""
         return asdict(self)
 
 
@@ -184,7 +184,7 @@ def sample(grid: Grid, scene: Scene, T_sl: np.ndarray, band: tuple[float, float]
 
 
 def seen(grid: Grid, T_sl: np.ndarray, points: Iterable[np.ndarray], *, band: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
-    """Give the cells (H, W) whose floor was seen, and those that showed at least a few points of the band."""
+    """Return the cells (H, W) whose floor was seen, and those that showed at least a few points of the band."""
     shape = grid.state.shape
     floor, in_band = np.zeros(shape, dtype=bool), np.zeros(shape, dtype=np.int64)
     T_ls = se3.inverse(T_sl)

@@ -60,7 +60,7 @@ def grid_score(run: RunDir, *, progress: Progress) -> dict[str, Any]:
     frames = frames[np.isfinite(features.depth_stamp[frames])]
 
     def points() -> Iterable[np.ndarray]:
-        """Give what each frame that the grid is made from truly showed."""
+        """Return what each frame that the grid is made from truly showed."""
         for row, true_row in progress(associate(features.depth_stamp[frames], truth.stamp), "eval map"):
             try:
                 depth = dataset.depth(int(frames[row]))

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from slamcli.depth import noise_model
-from slamcli.depth.icp import CLEANING, Relief
+from slamcli.depth.icp import CLEANING, OrientedPoints
 from slamcli.geometry import se3
 from slamcli.schema import Grid
 
@@ -32,7 +32,7 @@ class View:
     """What one frame shows, and from where."""
 
     T_lc: np.ndarray  # (4, 4) camera to level frame
-    relief: Relief  # its surface, in the camera's frame
+    relief: OrientedPoints  # its surface, in the camera's frame
     missing: float  # share of the pixels without a reading
 
     @property

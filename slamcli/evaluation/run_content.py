@@ -58,7 +58,7 @@ class Content:
         return len(self.stamp) - self.n_lost - int(self.has_pose.sum())
 
     def summary(self, stage: str) -> dict[str, Any]:
-        """Give what a stage said of itself; nothing where it was not run."""
+        """Return what a stage said of itself; nothing where it was not run."""
         return self.states[stage].record.get("summary", {})
 
 

@@ -42,11 +42,11 @@ class Ape:
 
     @property
     def coverage(self) -> float:
-        """Give the share of the recording's colour frames that have a pose."""
+        """Return the share of the recording's colour frames that have a pose."""
         return self.n_poses / self.n_frames if self.n_frames else 0.0
 
     def to_dict(self) -> dict[str, Any]:
-        """Give the figures as plain values."""
+        """Return the figures as plain values."""
         return {
             "name": self.name,
             "stage": self.stage,
@@ -78,7 +78,7 @@ class Rpe:
     rotation_deg: np.ndarray  # (N,) [degrees]
 
     def to_dict(self) -> dict[str, Any]:
-        """Give the figures as plain values; the unprefixed ones are the translation's."""
+        """Return the figures as plain values; the unprefixed ones are the translation's."""
         return {
             "name": self.name,
             "stage": self.stage,
@@ -94,7 +94,7 @@ class Rpe:
 
 
 def statistics(error: np.ndarray) -> dict[str, float]:
-    """Summarise errors (N,); [Z] (16) is `rmse`."""
+    """Summarize errors (N,); [Z] (16) is `rmse`."""
     return {
         "rmse": float(np.sqrt(np.mean(np.square(error)))),
         "mean": float(np.mean(error)),
@@ -143,7 +143,7 @@ def frame_count(run: Any) -> int:
 
 
 def ground_truth(run: Any) -> Trajectory:
-    """Give the true trajectory of a run's recording; SlamError when there is none."""
+    """Return the true trajectory of a run's recording; SlamError when there is none."""
     dataset = run.dataset()
     truth = dataset.ground_truth()
     if truth is None:

@@ -37,7 +37,7 @@ class SparseModel:
 
 
 def camera_model(camera: Camera) -> tuple[str, list[float]]:
-    """Give COLMAP's name of a lens model and its parameters."""
+    """Return COLMAP's name of a lens model and its parameters."""
     focal = [camera.fx, camera.fy, camera.cx + HALF_PIXEL, camera.cy + HALF_PIXEL]
     if camera.lens == EQUIDISTANT:
         return "OPENCV_FISHEYE", [*focal, camera.k1, camera.k2, camera.k3, camera.k4]
@@ -95,7 +95,7 @@ def _write(path: Path, data: bytes) -> Path:
 
 
 def _poses(model: SparseModel) -> list[list[float]]:
-    """Give qw qx qy qz tx ty tz of each image, world to camera."""
+    """Return qw qx qy qz tx ty tz of each image, world to camera."""
     if not np.isfinite(model.T_wc).all():
         raise SlamError("COLMAP: an image has no pose")
     T_cw = se3.inverse(model.T_wc).reshape(-1, 4, 4)
@@ -114,7 +114,7 @@ def _rows_in_image(model: SparseModel) -> np.ndarray:
 
 
 def _by_image(model: SparseModel) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Give each image's key points (N, 2) [px, COLMAP's] and their points (N,)."""
+    """Return each image's key points (N, 2) [px, COLMAP's] and their points (N,)."""
     order = np.argsort(model.obs_image, kind="stable")
     ends = np.searchsorted(model.obs_image[order], np.arange(len(model.name) + 1))
     xy = model.obs_xy[order].astype(np.float64) + HALF_PIXEL
@@ -123,7 +123,7 @@ def _by_image(model: SparseModel) -> list[tuple[np.ndarray, np.ndarray]]:
 
 
 def _tracks(model: SparseModel) -> list[np.ndarray]:
-    """Give the (image, key point) pairs of each point."""
+    """Return the (image, key point) pairs of each point."""
     ends = np.searchsorted(model.obs_point, np.arange(len(model.xyz) + 1))
     pairs = np.column_stack([model.obs_image, _rows_in_image(model)])
     return [pairs[a:b] for a, b in zip(ends[:-1], ends[1:], strict=True)]

@@ -60,7 +60,7 @@ def write_colour_ot(path: Path, tree: Octree, xyz: np.ndarray, rgb: np.ndarray, 
 
 
 def _records(tree: Octree, parents: str, dtype: np.dtype) -> tuple[np.ndarray, list[Level]]:
-    """Give all nodes depth first, with log-odds and children filled in, and level by level."""
+    """Return all nodes depth first, with log-odds and children filled in, and level by level."""
     nodes = levels(tree, parents=parents)
     record = np.empty(_n_nodes(nodes), dtype=dtype)
     for level, place in zip(nodes, preorder(nodes), strict=True):

@@ -57,7 +57,7 @@ def write_kitti(path: str | Path, trajectory: Trajectory) -> None:
 
 
 def _data_lines(path: Path) -> list[tuple[int, str]]:
-    """Give (line number, text) of the lines that hold data."""
+    """Return (line number, text) of the lines that hold data."""
     try:
         text = files.read_bytes(path, limit=MAX_BYTES).decode("utf-8", errors="replace")
     except OSError as error:

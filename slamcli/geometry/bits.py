@@ -9,7 +9,7 @@ from slamcli.jit.kernel import kernel
 @intrinsic
 def popcount(_typing, x):
     """Count the set bits of a uint64, as one instruction; spelled in shifts and masks it would cost every kernel compile time."""
-    return types.uint64(types.uint64), lambda _context, builder, _signature, arguments: builder.ctpop(arguments[0])
+    return types.uint64(types.uint64), lambda _context, sparse_map, _signature, arguments: sparse_map.ctpop(arguments[0])
 
 
 @kernel(inline="always")

@@ -73,7 +73,7 @@ class Camera:
 
     @property
     def K(self) -> np.ndarray:
-        """Give the intrinsic matrix (3, 3)."""
+        """Return the intrinsic matrix (3, 3)."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
     @property
@@ -88,11 +88,11 @@ class Camera:
 
     @property
     def coefficients(self) -> np.ndarray:
-        """Give k1 k2 p1 p2 k3 k4 k5 k6, (8,), the order of OpenCV and ROS."""
+        """Return k1 k2 p1 p2 k3 k4 k5 k6, (8,), the order of OpenCV and ROS."""
         return np.array([self.k1, self.k2, self.p1, self.p2, self.k3, self.k4, self.k5, self.k6], dtype=np.float64)
 
     def scaled(self, width: int, height: int) -> "Camera":
-        """Give the camera of the same pictures in another size; SlamError where the shape is another."""
+        """Return the camera of the same pictures in another size; SlamError where the shape is another."""
         across, down = width / self.width, height / self.height
         if abs(across / down - 1.0) > SHAPE_TOLERANCE:
             raise SlamError(f"a calibration for {self.width} x {self.height} px does not fit images of {width} x {height}: another shape")
@@ -102,20 +102,20 @@ class Camera:
         )  # fmt: skip
 
     def turned(self) -> "Camera":
-        """Give the camera of the same pictures turned clockwise by 90 degrees."""
+        """Return the camera of the same pictures turned clockwise by 90 degrees."""
         if self.is_distorted and (self.p1, self.p2) != (0.0, 0.0):
             raise SlamError("a calibration with tangential distortion cannot be turned with its pictures; give that of these images")
         return replace(self, width=self.height, height=self.width, fx=self.fy, fy=self.fx, cx=self.height - 1.0 - self.cy, cy=self.cx)
 
     @cached_property
     def rays(self) -> np.ndarray:
-        """Give per raw pixel the undistorted (x/z, y/z), (height, width, 2) float32: a pixel's point is depth * (x/z, y/z, 1)."""
+        """Return per raw pixel the undistorted (x/z, y/z), (height, width, 2) float32: a pixel's point is depth * (x/z, y/z, 1)."""
         u, v = np.meshgrid(np.arange(self.width, dtype=np.float64), np.arange(self.height, dtype=np.float64))
-        return self.normalise(np.stack([u.ravel(), v.ravel()], axis=1)).reshape(self.height, self.width, 2).astype(np.float32)
+        return self.normalize(np.stack([u.ravel(), v.ravel()], axis=1)).reshape(self.height, self.width, 2).astype(np.float32)
 
     @cached_property
     def metres(self) -> np.ndarray:
-        """Give the depth (65536,) float32 [m] of every possible reading, NaN where there is none: one look-up converts and masks."""
+        """Return the depth (65536,) float32 [m] of every possible reading, NaN where there is none: one look-up converts and masks."""
         read = np.arange(DEPTH_VALUES, dtype=np.float32) / np.float32(self.depth_scale)
         read[list(NO_READING)] = np.nan
         return self._from_read(read)
@@ -132,7 +132,7 @@ class Camera:
         return self._from_read(read)
 
     def reread(self, depth: np.ndarray, given: "Camera") -> np.ndarray:
-        """Give depth (...) [m], read under the calibration `given`, as it is under this one."""
+        """Return depth (...) [m], read under the calibration `given`, as it is under this one."""
         if (self.depth_scale, self.inverse_depth_offset) == (given.depth_scale, given.inverse_depth_offset):
             return depth
         with np.errstate(divide="ignore"):
@@ -168,10 +168,10 @@ class Camera:
         """Map raw pixels (..., 2) to undistorted pixels (..., 2)."""
         if not self.is_distorted:
             return np.array(xy, dtype=np.float64)
-        return self.normalise(xy) * [self.fx, self.fy] + [self.cx, self.cy]
+        return self.normalize(xy) * [self.fx, self.fy] + [self.cx, self.cy]
 
-    def normalise(self, xy: np.ndarray) -> np.ndarray:
-        """Give the directions (x/z, y/z), (..., 2), of raw pixels (..., 2)."""
+    def normalize(self, xy: np.ndarray) -> np.ndarray:
+        """Return the directions (x/z, y/z), (..., 2), of raw pixels (..., 2)."""
         raw = (np.asarray(xy, dtype=np.float64) - [self.cx, self.cy]) / [self.fx, self.fy]
         if not self.is_distorted:
             return raw
@@ -203,13 +203,13 @@ class Camera:
         )
 
     def _equidistant_factor(self, r: np.ndarray) -> np.ndarray:
-        """Give by what the distance r from the axis on the plane z = 1 is multiplied: theta (1 + k1 theta^2 + ..) / r."""
+        """Return by what the distance r from the axis on the plane z = 1 is multiplied: theta (1 + k1 theta^2 + ..) / r."""
         theta2 = np.arctan(r) ** 2
         theta_d = np.arctan(r) * (1.0 + theta2 * (self.k1 + theta2 * (self.k2 + theta2 * (self.k3 + theta2 * self.k4))))
         return np.where(r > 1e-9, theta_d / np.maximum(r, 1e-9), 1.0)
 
     def to_dict(self) -> dict:
-        """Give the keys of `camera.json`; what only other lenses have is left out."""
+        """Return the keys of `camera.json`; what only other lenses have is left out."""
         return {name: value for name, value in asdict(self).items() if name not in LATER_FIELDS or value != LATER_FIELDS[name]}
 
     @classmethod

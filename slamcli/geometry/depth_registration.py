@@ -24,13 +24,13 @@ class Registration:
 
     @cached_property
     def _ray(self) -> np.ndarray:
-        """Give per pixel of the depth camera its ray in the colour camera's axes, (h, w, 3) float32: x_c = depth * ray + t."""
+        """Return per pixel of the depth camera its ray in the colour camera's axes, (h, w, 3) float32: x_c = depth * ray + t."""
         ray = np.ones((self.depth_camera.height, self.depth_camera.width, 3))
         ray[..., :2] = self.depth_camera.rays
         return np.ascontiguousarray((ray @ self.T_cd[:3, :3].T).astype(np.float32))
 
     def apply(self, depth: np.ndarray) -> np.ndarray:
-        """Give depth (h, w) float32 [m] of the depth camera as the colour camera would see it, (H, W) float32, NaN = none.
+        """Return depth (h, w) float32 [m] of the depth camera as the colour camera would see it, (H, W) float32, NaN = none.
 
         Each reading covers its footprint among the raw pixels of the colour camera; where several do, the nearest counts.
         """
@@ -57,7 +57,7 @@ def resized(depth: np.ndarray, width: int, height: int) -> np.ndarray:
 
 @kernel
 def bend(x, y, lens, k):
-    """Give the point (x, y) of the plane z = 1 as the lens maps it.
+    """Return the point (x, y) of the plane z = 1 as the lens maps it.
 
     lens : 1 polynomial, 2 equidistant, 3 rational; k : (8,) as in Camera.coefficients
     """

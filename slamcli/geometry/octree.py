@@ -30,12 +30,12 @@ class Octree:
 
     @property
     def side(self) -> np.ndarray:
-        """Give the sides of the leaves (N,) [m]."""
+        """Return the sides of the leaves (N,) [m]."""
         return self.resolution * np.ldexp(1.0, DEPTH - self.depth.astype(np.int32))
 
     @property
     def centre(self) -> np.ndarray:
-        """Give the centres of the leaves (N, 3) [m]."""
+        """Return the centres of the leaves (N, 3) [m]."""
         return (voxel.unmorton(self.key) - CENTRE) * self.resolution + 0.5 * self.side[:, None]
 
     def is_occupied(self, threshold: float = 0.0) -> np.ndarray:
@@ -43,7 +43,7 @@ class Octree:
         return self.log_odds >= threshold
 
     def find(self, cell: np.ndarray) -> np.ndarray:
-        """Give the row of the leaf that holds each cell (M, 3), -1 where space is unknown."""
+        """Return the row of the leaf that holds each cell (M, 3), -1 where space is unknown."""
         cell = np.asarray(cell, dtype=np.int64)
         inside = np.all((cell >= 0) & (cell < 1 << DEPTH), axis=-1)
         key = voxel.morton(np.where(inside[..., None], cell, 0))
@@ -56,7 +56,7 @@ class Octree:
         return np.where(found, row, -1)
 
     def cells(self, xyz: np.ndarray) -> np.ndarray:
-        """Give the cells (M, 3) int64 that hold points (M, 3) [m]."""
+        """Return the cells (M, 3) int64 that hold points (M, 3) [m]."""
         return np.floor(np.asarray(xyz, dtype=np.float64) * (1.0 / self.resolution)).astype(np.int64) + CENTRE
 
 
@@ -81,7 +81,7 @@ def prune(tree: Octree) -> Octree:
 
 
 def _whole_families(prefix: np.ndarray, log_odds: np.ndarray) -> np.ndarray:
-    """Give the rows where eight siblings with one value begin; `prefix` is sorted and unique."""
+    """Return the rows where eight siblings with one value begin; `prefix` is sorted and unique."""
     first = np.flatnonzero(prefix[:-7] >> 3 == prefix[7:] >> 3) if len(prefix) >= 8 else np.zeros(0, dtype=np.int64)
     family = log_odds[first[:, None] + np.arange(8)]
     return first[(family == family[:, :1]).all(axis=1)]
@@ -108,7 +108,7 @@ class Level:
 
 
 def levels(tree: Octree, *, parents: str = "max", threshold: float = 0.0) -> list[Level]:
-    """Give the nodes from the root (index 0) to depth 16; an empty tree has none at any depth.
+    """Return the nodes from the root (index 0) to depth 16; an empty tree has none at any depth.
 
     parents : "max" is OctoMap's rule for inner values; "mean" is that of Zhao et al. (14), the mean over all eight children,
         of which an unknown one counts as log-odds 0.
@@ -154,7 +154,7 @@ def _merge(a: Level, b: Level) -> Level:
 
 
 def preorder(nodes: list[Level], *, inner_only: bool = False) -> list[np.ndarray]:
-    """Give each node's place in a depth-first listing of all nodes, or of the inner ones (a leaf's place then has no meaning)."""
+    """Return each node's place in a depth-first listing of all nodes, or of the inner ones (a leaf's place then has no meaning)."""
     place = [np.zeros(len(nodes[0].prefix), dtype=np.int64)]
     for above, level in zip(nodes[:-1], nodes[1:], strict=True):
         parent = np.searchsorted(above.prefix, level.prefix >> 3)

@@ -13,7 +13,7 @@ SMALL_ANGLE = 1e-4  # [rad] below this the series in phi^2 are exact to double p
 
 
 def hat(phi: np.ndarray) -> np.ndarray:
-    """Give the skew matrices (..., 3, 3) with ``hat(a) @ b == cross(a, b)``."""
+    """Return the skew matrices (..., 3, 3) with ``hat(a) @ b == cross(a, b)``."""
     phi = np.asarray(phi, dtype=np.float64)
     out = np.zeros(phi.shape[:-1] + (3, 3))
     out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -phi[..., 2], phi[..., 1], -phi[..., 0]
@@ -85,7 +85,7 @@ def log(T: np.ndarray) -> np.ndarray:
 
 
 def adjoint(T_ab: np.ndarray) -> np.ndarray:
-    """Give Ad (..., 6, 6) with ``T @ exp(xi) @ inverse(T) == exp(Ad @ xi)``."""
+    """Return Ad (..., 6, 6) with ``T @ exp(xi) @ inverse(T) == exp(Ad @ xi)``."""
     T_ab = np.asarray(T_ab, dtype=np.float64)
     R = T_ab[..., :3, :3]
     out = np.zeros(T_ab.shape[:-2] + (6, 6))
@@ -96,7 +96,7 @@ def adjoint(T_ab: np.ndarray) -> np.ndarray:
 
 
 def quaternion_xyzw(T: np.ndarray) -> np.ndarray:
-    """Give unit quaternions (..., 4), order x y z w, of the rotations in (..., 4, 4) or (..., 3, 3).
+    """Return unit quaternions (..., 4), order x y z w, of the rotations in (..., 4, 4) or (..., 3, 3).
 
     From the largest of its four components, which loses no digits: S. Shepperd, Quaternion from rotation matrix, JGC 1978,
     doi:10.2514/3.55767b
@@ -125,8 +125,8 @@ def from_quaternion(position: np.ndarray, quaternion: np.ndarray) -> np.ndarray:
     return T
 
 
-def orthonormalise(T: np.ndarray) -> np.ndarray:
-    """Give T (..., 4, 4) with the rotation nearest to its upper left block.
+def orthonormalize(T: np.ndarray) -> np.ndarray:
+    """Return T (..., 4, 4) with the rotation nearest to its upper left block.
 
     Every law here, `inverse` first, rests on orthonormal rotations; solvers of polynomials and long products do not keep them so.
     """

@@ -39,26 +39,26 @@ gather = kernel(_gather)
 
 
 def morton(cell: np.ndarray) -> np.ndarray:
-    """Give the Morton keys (N,) int64 of cells (N, 3), each number in [0, 2^21)."""
+    """Return the Morton keys (N,) int64 of cells (N, 3), each number in [0, 2^21)."""
     cell = np.asarray(cell, dtype=np.int64)
     return _spread(cell[..., 0]) | _spread(cell[..., 1]) << 1 | _spread(cell[..., 2]) << 2
 
 
 def unmorton(key: np.ndarray) -> np.ndarray:
-    """Give the cells (N, 3) int64 of Morton keys (N,)."""
+    """Return the cells (N, 3) int64 of Morton keys (N,)."""
     key = np.asarray(key, dtype=np.int64)
     return np.stack([_gather(key), _gather(key >> 1), _gather(key >> 2)], axis=-1)
 
 
 @kernel
 def first_slot(key, mask):
-    """Give the slot a key's search starts at; the eight children of a node share a cache line."""
+    """Return the slot a key's search starts at; the eight children of a node share a cache line."""
     return (((key >> 3) * GOLDEN >> 32) + (key & 7)) & mask
 
 
 @kernel
 def find_row(slot_row, row_key, key):
-    """Give the row of a key, -1 where it has none."""
+    """Return the row of a key, -1 where it has none."""
     mask = slot_row.size - 1
     slot = first_slot(key, mask)
     while slot_row[slot] >= 0:
@@ -70,7 +70,7 @@ def find_row(slot_row, row_key, key):
 
 @kernel
 def find_or_add(slot_row, row_key, n_rows, key):
-    """Give the row of a key; a new key gets row `n_rows`, and it is the caller who counts on. The table must have room."""
+    """Return the row of a key; a new key gets row `n_rows`, and it is the caller who counts on. The table must have room."""
     mask = slot_row.size - 1
     slot = first_slot(key, mask)
     while slot_row[slot] >= 0:

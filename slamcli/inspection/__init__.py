@@ -49,7 +49,7 @@ class Inspection:
 
     @property
     def level(self) -> str:
-        """Give the gravest level found."""
+        """Return the gravest level found."""
         levels = {finding.level for finding in self.findings}
         return next((level for level in (ERROR, WARNING) if level in levels), NOTE)
 
@@ -59,7 +59,7 @@ class Inspection:
         return VERDICTS[self.level]
 
     def to_dict(self) -> dict[str, Any]:
-        """Give everything as plain values."""
+        """Return everything as plain values."""
         return {
             "recording": self.recording,
             "verdict": self.verdict,

@@ -62,7 +62,7 @@ def look(dataset: Dataset, *, workers: int, progress: Progress, frames: Sequence
 
 
 def counting_scale(camera: Camera) -> float:
-    """Give the units per metre in which readings are counted: the recording's own, millimetres for floating-point metres."""
+    """Return the units per metre in which readings are counted: the recording's own, millimetres for floating-point metres."""
     return camera.depth_scale if camera.depth_scale >= FINEST_WHOLE_UNIT else MILLIMETRES
 
 
@@ -154,7 +154,7 @@ def misplaced(thumbnail: np.ndarray, stamp: np.ndarray) -> np.ndarray:
 
 
 def _difference(thumbnail: np.ndarray, distance: int) -> np.ndarray:
-    """Give the mean absolute difference of pictures `distance` apart, (F - distance,), brightness taken out; NaN where one is missing."""
+    """Return the mean absolute difference of pictures `distance` apart, (F - distance,), brightness taken out; NaN where one is missing."""
     a, b = thumbnail[:-distance], thumbnail[distance:]
     difference = b - a
     is_valid = np.isfinite(difference)

@@ -198,7 +198,7 @@ def _at_lag(colours: _Colours, edges: list[_Edges], lag: float) -> np.ndarray:
 
 
 def _score(colours: _Colours, places: np.ndarray, dx: int, dy: int) -> float:
-    """Give the mean steepness under the edges when moved by (dx, dy) [px]."""
+    """Return the mean steepness under the edges when moved by (dx, dy) [px]."""
     return float(colours.steepness.reshape(-1)[places + (dy * colours.steepness.shape[3] + dx)].mean()) if len(places) else 0.0
 
 

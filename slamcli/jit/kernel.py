@@ -26,7 +26,7 @@ def kernel(function: Callable | None = None, **options: Any) -> Any:
 
 
 def argument_types(compiled: Any) -> tuple:
-    """Give the numba types of a kernel's arguments, () where they are not declared."""
+    """Return the numba types of a kernel's arguments, () where they are not declared."""
     code = compiled.py_func.__code__
     annotations = compiled.py_func.__annotations__
     names = code.co_varnames[: code.co_argcount]

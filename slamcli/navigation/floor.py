@@ -85,7 +85,7 @@ def vertical(patches: Patches, T_wk: np.ndarray) -> np.ndarray:
 
 
 def _sign(direction: np.ndarray, T_wk: np.ndarray) -> float:
-    """Give the sign that makes a vertical direction point up: as the images do or, where these lie flat, against the view."""
+    """Return the sign that makes a vertical direction point up: as the images do or, where these lie flat, against the view."""
     lean = float((-T_wk[:, :3, 1] @ direction).mean())
     if abs(lean) < UPRIGHT_MIN:
         lean = float((-T_wk[:, :3, 2] @ direction).mean())
@@ -110,7 +110,7 @@ def _unit(vector: np.ndarray, otherwise: np.ndarray) -> np.ndarray:
 
 
 def _frequent_directions(normal: np.ndarray, *, count: int = 24) -> list[np.ndarray]:
-    """Give the directions (3,) most normals share, refined to the mean of those near each; opposite normals count as one."""
+    """Return the directions (3,) most normals share, refined to the mean of those near each; opposite normals count as one."""
     bins = np.round(normal * 6.0).astype(np.int64) @ [169, 13, 1]  # -6..6 per axis; the opposite normal's number is the negative
     counts = np.bincount(np.abs(bins))
     directions = []
@@ -156,7 +156,7 @@ def _refined(patches: Patches, rows: np.ndarray, plane: np.ndarray, least: float
 
 
 def _levels(height: np.ndarray, least: float) -> np.ndarray:
-    """Give the heights, lowest first, at which upward-facing patches gather."""
+    """Return the heights, lowest first, at which upward-facing patches gather."""
     low = height.min()
     count = np.bincount(((height - low) / LEVEL_BIN).astype(np.int64))
     window = int(PEAK_HALF_WIDTH / LEVEL_BIN)
@@ -174,7 +174,7 @@ def _nothing_below(patches: Patches, support: Support, settings: GroundConfig) -
 
 
 def level_frame(plane: np.ndarray, T_wc: np.ndarray) -> np.ndarray:
-    """Give T_lw (4, 4): z along the plane's normal, z = 0 on it, origin below the camera T_wc, x along that camera's heading."""
+    """Return T_lw (4, 4): z along the plane's normal, z = 0 on it, origin below the camera T_wc, x along that camera's heading."""
     up = plane[:3]
     heading = T_wc[:3, 2] - (T_wc[:3, 2] @ up) * up
     if np.linalg.norm(heading) < 0.2:  # looking straight down: the image's up is ahead

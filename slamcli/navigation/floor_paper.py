@@ -43,7 +43,7 @@ def paper_plane(patches: Patches, up: np.ndarray, *, settings: GroundConfig, rng
 
 
 def ground_points(patches: Patches, up: np.ndarray, *, settings: GroundConfig) -> np.ndarray:
-    """Give the rows of the points with the three most frequent gradients in the middle of the ground key frames, [L] 2.1."""
+    """Return the rows of the points with the three most frequent gradients in the middle of the ground key frames, [L] 2.1."""
     gradient = image_gradient(patches)
     extent = np.array(patches.shape)
     offset = np.abs(patches.grid - (extent - 1) / 2.0)
@@ -53,7 +53,7 @@ def ground_points(patches: Patches, up: np.ndarray, *, settings: GroundConfig) -
 
 
 def ground_frames(patches: Patches, up: np.ndarray) -> np.ndarray:
-    """Give the key frames with the most patches that face up, at least three."""
+    """Return the key frames with the most patches that face up, at least three."""
     count = np.bincount(patches.frame[patches.normal @ up > FACES_UP], minlength=int(patches.frame.max(initial=-1)) + 1)
     return np.sort(np.argsort(-count, kind="stable")[: max(3, int(np.ceil(GROUND_SHARE * len(count))))])
 
@@ -66,7 +66,7 @@ def _frequent(gradient: np.ndarray, rows: np.ndarray, settings: GroundConfig) ->
 
 
 def image_gradient(patches: Patches) -> np.ndarray:
-    """Give G (N, 3) [m], the step from the upper neighbour's point to each point, [L] (16); NaN where there is no upper neighbour."""
+    """Return G (N, 3) [m], the step from the upper neighbour's point to each point, [L] (16); NaN where there is no upper neighbour."""
     rows, columns = patches.shape
     at = np.full((int(patches.frame.max(initial=-1)) + 1, rows, columns), -1, dtype=np.int64)
     at[patches.frame, patches.grid[:, 0], patches.grid[:, 1]] = np.arange(len(patches.xyz))
@@ -75,7 +75,7 @@ def image_gradient(patches: Patches) -> np.ndarray:
 
 
 def _plane_through(xyz: np.ndarray) -> np.ndarray | None:
-    """Give the plane (4,) through three points (3, 3), None where they lie on a line."""
+    """Return the plane (4,) through three points (3, 3), None where they lie on a line."""
     normal = np.cross(xyz[1] - xyz[0], xyz[2] - xyz[0])
     length = np.linalg.norm(normal)
     if length < 1e-6:

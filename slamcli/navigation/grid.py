@@ -99,7 +99,7 @@ def fuse(views: Iterable[View], *, settings: GridConfig) -> Grid:
 
 
 def _sight(view: View, low: np.ndarray, settings: GridConfig) -> tuple:
-    """Give a view's cells and camera as `_drop_hidden` takes them: rows, columns, x, y [cells], z, band and reach."""
+    """Return a view's cells and camera as `_drop_hidden` takes them: rows, columns, x, y [cells], z, band and reach."""
     x, y = view.camera[:2] / settings.resolution - low
     cells = view.cell[:, 1] - low[1], view.cell[:, 0] - low[0]
     return *cells, x, y, view.camera[2], settings.band_low, settings.band_high, DEEPEST / settings.resolution
@@ -198,7 +198,7 @@ def _with_neighbours(standing: np.ndarray) -> np.ndarray:
 
 
 def extent(views: list[View], resolution: float) -> tuple[np.ndarray, tuple[int, int]]:
-    """Give the lowest cell (2,) and the grid's shape (rows, columns) that hold all that was seen and the cameras themselves."""
+    """Return the lowest cell (2,) and the grid's shape (rows, columns) that hold all that was seen and the cameras themselves."""
     cells = [np.concatenate([view.cell, np.floor(view.camera[None, :2] / resolution)]) for view in views if len(view.cell)]
     if not cells:
         return np.zeros(2, dtype=np.int64), (1, 1)
@@ -283,7 +283,7 @@ def paper_update(p_empty: np.ndarray, n_seen: np.ndarray, rows: np.ndarray, colu
 
 
 def view_probability(n: np.ndarray, *, n_low: int, n_high: int) -> np.ndarray:
-    """Give P(E) of cells with n points in one view, [L] (20)."""
+    """Return P(E) of cells with n points in one view, [L] (20)."""
     p_empty = 1.0 - n / max(int(n.max(initial=1)), 1)
     return np.where(n < n_low, 1.0, np.where(n > n_high, 0.0, p_empty))
 

@@ -59,7 +59,7 @@ def _empty(resolution: float) -> Grid:
 
 
 def _slices(low: np.ndarray, high: np.ndarray, settings: GridConfig) -> np.ndarray:
-    """Give the slices of the band (N,) uint16 that leaves from `low` to `high` [m] fill; 0 for those of the floor."""
+    """Return the slices of the band (N,) uint16 that leaves from `low` to `high` [m] fill; 0 for those of the floor."""
     scale = SLICES / (settings.band_high - settings.band_low)
     first = np.clip(np.floor((low - settings.band_low) * scale + EDGE), 0, SLICES).astype(np.int64)
     last = np.clip(np.ceil((high - settings.band_low) * scale - EDGE), 0, SLICES).astype(np.int64)

@@ -82,7 +82,7 @@ def nearest_room(
 
 
 def obstacle_distance(grid: Grid, *, allow_unknown: bool) -> np.ndarray:
-    """Give per cell (H, W) [m] the distance from its centre to the edge of the nearest blocked cell, 0 inside one.
+    """Return per cell (H, W) [m] the distance from its centre to the edge of the nearest blocked cell, 0 inside one.
 
     Outside the grid everything is unknown. Half a cell's diagonal is taken off the distance between centres: never too much.
     """
@@ -99,7 +99,7 @@ def obstacle_distance(grid: Grid, *, allow_unknown: bool) -> np.ndarray:
 
 
 def _cell_cost(margin: np.ndarray, clearance: float, weight: float) -> np.ndarray:
-    """Give the factor (H, W) on a step's length, infinite where the robot would touch."""
+    """Return the factor (H, W) on a step's length, infinite where the robot would touch."""
     nearness = 1.0 - np.clip(margin / clearance, 0.0, 1.0) if clearance > 0.0 else np.zeros(margin.shape)
     return np.where(margin >= 0.0, 1.0 + weight * nearness**2, np.inf)
 
@@ -234,7 +234,7 @@ def _doubled(values):
 
 
 def _cheapest(cost: np.ndarray, start: tuple[int, int], goal: tuple[int, int]) -> np.ndarray | None:
-    """Give the cells (N, 2) of the cheapest path, None where there is none."""
+    """Return the cells (N, 2) of the cheapest path, None where there is none."""
     columns = cost.shape[1]
     before = np.full(cost.size, -1, dtype=np.int64)
     first, last = start[0] * columns + start[1], goal[0] * columns + goal[1]

@@ -62,7 +62,7 @@ def _patches(depth: np.ndarray, rays: np.ndarray, T_wk: np.ndarray, side: int, m
 
 
 def _block_points(depth: np.ndarray, rays: np.ndarray, side: int, max_range: float) -> np.ndarray:
-    """Average up to 4 x 4 pixels of each `side` x `side` block to a point x y z and its depth's noise (R, C, 4), NaN where it is no one surface.
+    """Average up to 4 x 4 pixels of each `side` x `side` block to a point x y z and its depth's noise (R, C, 4), NaN where the patch spans a depth discontinuity.
 
     Inverse depth is averaged: on a plane it is linear in the pixel, so that the mean lies on the plane at the pixels' mean ray.
     """
@@ -82,7 +82,7 @@ def _block_points(depth: np.ndarray, rays: np.ndarray, side: int, max_range: flo
 
 
 def _samples(image: np.ndarray, side: int) -> np.ndarray:
-    """Give up to 4 x 4 pixels (S, R, C) of each block of an image (H, W)."""
+    """Return up to 4 x 4 pixels (S, R, C) of each block of an image (H, W)."""
     rows, columns = image.shape[0] // side, image.shape[1] // side
     step = (side + 3) // 4
     per_side = -(-side // step)
@@ -91,7 +91,7 @@ def _samples(image: np.ndarray, side: int) -> np.ndarray:
 
 
 def _normals(points: np.ndarray) -> np.ndarray:
-    """Give unit normals (R, C, 3) towards the camera by central differences over the blocks' points; NaN at edges and jumps of depth."""
+    """Return unit normals (R, C, 3) towards the camera by central differences over the blocks' points; NaN at edges and jumps of depth."""
     out = np.full((*points.shape[:2], 3), np.nan)
     middle = points[1:-1, 1:-1, :3]
     a = points[1:-1, 2:, :3] - points[1:-1, :-2, :3]
@@ -107,7 +107,7 @@ def _normals(points: np.ndarray) -> np.ndarray:
 
 
 def fit_plane(xyz: np.ndarray, weight: np.ndarray, start: np.ndarray, *, rounds: int = 5) -> np.ndarray:
-    """Minimise the weighted sum of distances of points (N, 3) to a plane (4,), [L] (18), by re-weighted least squares."""
+    """Minimize the weighted sum of distances of points (N, 3) to a plane (4,), [L] (18), by re-weighted least squares."""
     plane = start
     for _ in range(rounds):
         residual = np.abs(xyz @ plane[:3] + plane[3])

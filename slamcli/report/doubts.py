@@ -7,7 +7,7 @@ import numpy as np
 
 from slamcli.evaluation.run_content import Content
 from slamcli.runs.staleness import MISSING
-from slamcli.schema import ON_SHAPE, RELOCALISED, TRACKED
+from slamcli.schema import ON_DEPTH, RELOCALIZED, TRACKED
 from slamcli.slam import doubt
 
 GOOD, NOTE, BAD = "good", "note", "bad"
@@ -89,10 +89,10 @@ def _features(content: Content) -> list[Remark]:
     few = int((content.n_features < FEW_FEATURES).sum())
     if few > MANY * n:
         found.append(Remark(BAD, f"{few} of {n} frames have fewer than {FEW_FEATURES} features: too dark, blurred, or bare walls."))
-    on_shape = int((content.state == ON_SHAPE).sum())
-    if on_shape:
-        found.append(Remark(NOTE, f"{on_shape} frames were placed by the shape that depth shows, as their pictures show too little."))
-    weak = int(((content.n_inliers < FEW_INLIERS) & np.isin(content.state, (TRACKED, RELOCALISED))).sum())
+    on_depth = int((content.state == ON_DEPTH).sum())
+    if on_depth:
+        found.append(Remark(NOTE, f"{on_depth} frames were placed by the shape that depth shows, as their pictures show too little."))
+    weak = int(((content.n_inliers < FEW_INLIERS) & np.isin(content.state, (TRACKED, RELOCALIZED))).sum())
     if weak > MANY * n:
         found.append(Remark(NOTE, f"The poses of {weak} frames rest on fewer than {FEW_INLIERS} landmarks and may be inaccurate."))
     without = content.summary("extract").get("frames_without_depth", 0)

@@ -52,7 +52,7 @@ def resource(name: str) -> str:
 
 
 def _data(content: Content) -> dict[str, Any]:
-    """Give what the interactive parts draw: missing values are null."""
+    """Return what the interactive parts draw: missing values are null."""
     ape = content.ape.get(content.stage)
     error = np.full(len(content.stamp), np.nan)
     if ape is not None:

@@ -90,7 +90,7 @@ def restored_config(records: Records) -> Config:
 
 
 def restored_info(records: Records) -> dict[str, str]:
-    """Give the name, the folder and the digest of the recording that the stages read; nothing where none recorded it."""
+    """Return the name, the folder and the digest of the recording that the stages read; nothing where none recorded it."""
     for record in reversed(list(records.values())):
         recording = record.get("recording", {})
         if "dataset" in record["inputs"] and {"dataset", "root"} <= recording.keys():

@@ -16,10 +16,10 @@ from slamcli.runs.pipeline import Pipeline
 from slamcli.runs.run_directory import RunDir
 from slamcli.schema import LOST, CoarseDepth, Features, Map, Matches, Timing, Tracks, Trajectory, Words, trajectory
 from slamcli.slam import final_refinement
-from slamcli.slam.depth_tracking import Reliefs
+from slamcli.slam.depth_tracking import FramePoints
 from slamcli.slam.localizer import Localizer
 from slamcli.slam.place_recognition import PlaceIndex
-from slamcli.sparse_map.sparse_map import MapBuilder
+from slamcli.sparse_map.sparse_map import SparseMap
 
 LOOKS = 2  # at all frames with hindsight: the motion that rectifies them comes from the look before
 
@@ -27,7 +27,7 @@ Progress = Callable[..., Iterable]
 
 
 @dataclass(frozen=True)
-class Localised:
+class Localized:
     """Where the camera of a recording was in the world of a run."""
 
     trajectory: Trajectory  # of the frames that were found
@@ -35,19 +35,19 @@ class Localised:
 
     @property
     def coverage(self) -> float:
-        """Give the share of the frames that were found."""
+        """Return the share of the frames that were found."""
         return len(self.trajectory.stamp) / self.n_frames
 
     def to_dict(self) -> dict[str, Any]:
-        """Give the figures as plain values."""
+        """Return the figures as plain values."""
         return {"n_frames": self.n_frames, "n_poses": len(self.trajectory.stamp), "coverage": self.coverage}
 
 
-def localise(run: RunDir, recording: Dataset, *, progress: Progress) -> Localised:
+def localize(run: RunDir, recording: Dataset, *, progress: Progress) -> Localized:
     """Find every frame of `recording` in the map that loop left in `run`; the map stays as it is.
 
     The recording goes through extract and match under the run's own configuration, in a folder that is removed again.
-    Raises SlamError where the run has no map or where no frame was recognised.
+    Raises SlamError where the run has no map or where no frame was recognized.
     """
     config = run.config()
     run.stage_path("loop")
@@ -58,18 +58,18 @@ def localise(run: RunDir, recording: Dataset, *, progress: Progress) -> Localise
         return _find(run, new, config, progress)
 
 
-def _find(run: RunDir, new: RunDir, config: Config, progress: Progress) -> Localised:
+def _find(run: RunDir, new: RunDir, config: Config, progress: Progress) -> Localized:
     map_, when = run.load(Map, "loop"), run.load(Timing, "loop")
     given, camera = run.camera(), run.camera("loop")
-    builder = MapBuilder.from_map(self_calibration.correct(run.load(Features, "extract"), given, Sensing(camera, when, {})), map_)
+    sparse_map = SparseMap.from_map(self_calibration.correct(run.load(Features, "extract"), given, Sensing(camera, when, {})), map_)
     features = new.load(Features, "extract")
     if new.camera() == given:  # the same camera: what the run found of it holds here too
         features = self_calibration.recalibrate(features, given, camera)
     else:
         camera = new.camera()
     localizer = Localizer(
-        builder,
-        PlaceIndex(run.load(Words, "match"), builder.kf.frame),
+        sparse_map,
+        PlaceIndex(run.load(Words, "match"), sparse_map.kf.frame),
         features,
         new.load(Words, "match"),
         new.load(Matches, "match"),
@@ -77,24 +77,24 @@ def _find(run: RunDir, new: RunDir, config: Config, progress: Progress) -> Local
         config.track,
         config.sensor,
         np.random.default_rng(config.seed),
-        reliefs=Reliefs(new.load(CoarseDepth, "extract"), new.camera(), config.sensor).under(camera),
-        map_reliefs=Reliefs(run.load(CoarseDepth, "extract"), given, config.sensor).under(run.camera("loop")),
+        frame_points=FramePoints(new.load(CoarseDepth, "extract"), new.camera(), config.sensor).under(camera),
+        map_frame_points=FramePoints(run.load(CoarseDepth, "extract"), given, config.sensor).under(run.camera("loop")),
     )
     for i in progress(range(len(features.stamp)), "localize"):
         localizer.process(i)
     tracks = localizer.tracks()
     if (tracks.state == LOST).all():
-        raise SlamError(f"{new.info()['root']}: no frame was recognised in the map of {run.path}; do both show the same place?")
-    tracks = _refine(builder, features, tracks, when, map_, camera, config, progress)
-    return Localised(trajectory(np.array(features.stamp), tracks, map_), len(features.stamp))
+        raise SlamError(f"{new.info()['root']}: no frame was recognized in the map of {run.path}; do both show the same place?")
+    tracks = _refine(sparse_map, features, tracks, when, map_, camera, config, progress)
+    return Localized(trajectory(np.array(features.stamp), tracks, map_), len(features.stamp))
 
 
-def _refine(builder, features, tracks: Tracks, when: Timing, map_: Map, camera, config: Config, progress: Progress) -> Tracks:
+def _refine(sparse_map, features, tracks: Tracks, when: Timing, map_: Map, camera, config: Config, progress: Progress) -> Tracks:
     """Look at all frames again, their features rectified by the timing that the run found for its camera."""
     for _ in range(LOOKS):
         moving = replace(when, twist=rolling_shutter.frame_twists(features.stamp, tracks, map_))
         rectified = rolling_shutter.rectify(features, moving, camera)
         tracks = final_refinement.refine_frames(
-            builder, rectified, tracks, camera, config.sensor, config.track, progress, workers=config.run.workers
+            sparse_map, rectified, tracks, camera, config.sensor, config.track, progress, workers=config.run.workers
         )
     return tracks

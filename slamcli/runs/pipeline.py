@@ -65,7 +65,7 @@ class Inputs:
 
     @property
     def dataset(self) -> "Dataset":
-        """Give the recording."""
+        """Return the recording."""
         self._declared("dataset")
         return self._dataset()
 
@@ -77,7 +77,7 @@ class Inputs:
         return artifacts.load(cls, self._run.intact(self._declared(stage), *names))
 
     def camera(self, stage: str = "extract") -> "Camera":
-        """Give the intrinsics that extract used, or those known after optimize or loop."""
+        """Return the intrinsics that extract used, or those known after optimize or loop."""
         return self._run.camera(self._declared(stage))
 
     def path(self, stage: str, *names: str) -> Path:
@@ -108,7 +108,7 @@ class Tools:
             log.debug("%s: %s", self._stage, message)
 
     def rng(self) -> "np.random.Generator":
-        """Give the stage's own random numbers: the same for the same seed, whatever ran before."""
+        """Return the stage's own random numbers: the same for the same seed, whatever ran before."""
         import numpy as np
 
         return np.random.default_rng([self._seed, zlib.crc32(self._stage.encode())])

@@ -157,7 +157,7 @@ class RunDir:
         return True
 
     def _records(self) -> dict[str, dict[str, Any]]:
-        """Give the records of the stages that have a sound one, in the order in which they were written."""
+        """Return the records of the stages that have a sound one, in the order in which they were written."""
         found = {}
         for stage in NAMES:
             with contextlib.suppress(SlamError):
@@ -206,7 +206,7 @@ class RunDir:
         return path
 
     def intact(self, stage: str, *names: str) -> Path:
-        """Give the folder of a finished stage after comparing files of it with the digests recorded; SlamError where one differs."""
+        """Return the folder of a finished stage after comparing files of it with the digests recorded; SlamError where one differs."""
         record = self.record(stage) or {"outputs": {}}
         for name in names:
             if name not in record["outputs"]:
@@ -311,7 +311,7 @@ class RunDir:
 
     @contextmanager
     def writing(self, stage: str) -> Iterator[Path]:
-        """Give a fresh folder for a stage's output; it is removed again unless `commit` put it in place."""
+        """Return a fresh folder for a stage's output; it is removed again unless `commit` put it in place."""
         folder = self.path / f".{stage}.{os.getpid()}"
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir()

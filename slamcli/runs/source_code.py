@@ -88,7 +88,7 @@ def imported(file: str) -> frozenset[str]:
 
 
 def _modules(text: str) -> Iterator[str]:
-    """Give the dotted names that import statements mention; of ``from a import b`` both a and a.b, which may be no module."""
+    """Return the dotted names that import statements mention; of ``from a import b`` both a and a.b, which may be no module."""
     for statement in IMPORT.finditer(FOR_TYPE_CHECKERS.sub("", text)):
         home, names, plain = statement.groups()
         if plain:
@@ -100,7 +100,7 @@ def _modules(text: str) -> Iterator[str]:
 
 @functools.cache
 def _files_of(module: str) -> tuple[str, ...]:
-    """Give the file of a module, after those of the packages it lies in; what is no module gives those alone."""
+    """Return the file of a module, after those of the packages it lies in; what is no module gives those alone."""
     parts = module.split(".")[1:]
     packages = ["/".join([*parts[:k], "__init__.py"]) for k in range(len(parts) + 1)]
     return tuple(file for file in [*packages, "/".join(parts) + ".py"] if _is_file(file))

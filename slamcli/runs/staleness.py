@@ -30,7 +30,7 @@ class State:
 
 
 def declared(stage: Stage, config: Config) -> dict[str, Any]:
-    """Give the configuration that may change a stage's result, as `stage.json` records it."""
+    """Return the configuration that may change a stage's result, as `stage.json` records it."""
     values: dict[str, Any] = {"seed": config.seed}
     for name in stage.config:
         section = getattr(config, name)
@@ -39,7 +39,7 @@ def declared(stage: Stage, config: Config) -> dict[str, Any]:
 
 
 def named_files(stage: Stage, config: Config) -> dict[str, str]:
-    """Give the options of a stage that name an input file, as ``{"section.option": path}``."""
+    """Return the options of a stage that name an input file, as ``{"section.option": path}``."""
     found = {}
     for name in stage.config:
         section = getattr(config, name)

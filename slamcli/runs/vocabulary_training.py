@@ -21,7 +21,7 @@ Picture = Callable[[], np.ndarray]
 def descriptors(
     sources: Sequence[str], *, features: int, every: int, progress: Callable = lambda items, label, total=None: items
 ) -> list[np.ndarray]:
-    """Give the descriptors (N_i, 32) uint8 of each picture of folders of pictures and of each `every`-th frame of recordings.
+    """Return the descriptors (N_i, 32) uint8 of each picture of folders of pictures and of each `every`-th frame of recordings.
 
     Pictures that cannot be used are left out; SlamError where a source has none.
     """

@@ -18,7 +18,7 @@ import numpy as np
 
 from slamcli.config.options import SensorConfig
 from slamcli.depth import icp, icp_kernels
-from slamcli.depth.icp import Relief
+from slamcli.depth.icp import OrientedPoints
 from slamcli.estimation import camera_pose, minimal_solvers
 from slamcli.estimation.camera_pose import PoseEstimate
 from slamcli.geometry import se3
@@ -44,7 +44,7 @@ GRID_M, GRID_RAD = (-0.2, -0.1, 0.0, 0.1, 0.2), (-0.12, 0.0, 0.12)  # forward, a
 SCHEDULE = np.array([(4.0, 0.10, 6.0, 5e-4), (2.0, 0.05, 5.0, 2e-4)])  # as of depth/icp.py: with a shorter reach
 NEAR_VARIANCE = 4.0  # [m^2] at which distance squared a reading's variance is as the sensor's; nearer counts less
 FAR = 4.0  # [m] beyond which it does not count more
-KEPT = 48  # reliefs
+KEPT = 48  # frame_points
 
 
 @dataclass(frozen=True)
@@ -58,8 +58,8 @@ class Common:
     sigma_px: np.ndarray  # (N,)
     sigma_z: np.ndarray  # (N,) [m]
     weight: np.ndarray  # (N,) [m^2] surface that each stands for
-    source: Relief  # of the reference
-    target: Relief  # of the frame
+    source: OrientedPoints  # of the reference
+    target: OrientedPoints  # of the frame
     surface: float  # [m^2] that each shows, on average
 
 
@@ -83,7 +83,7 @@ class BackgroundMotion:
         """Take the features and coarse depth images (F, V, U) of a recording."""
         self._features, self._words, self._depth, self._camera, self._sensor, self._rng = features, words, depth, camera, sensor, rng
         self._pinhole = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
-        self._reliefs: OrderedDict[int, Relief] = OrderedDict()
+        self._frame_points: OrderedDict[int, OrientedPoints] = OrderedDict()
 
     def poses(self, progress: Callable[[range], Iterable[int]] = iter) -> np.ndarray:
         """Estimate T_wc (F, 4, 4) of all frames, the first at the origin; local motion is right, drift adds up."""
@@ -227,12 +227,12 @@ class BackgroundMotion:
         )  # fmt: skip
         return first_r + row[:, 1].astype(np.int64), first_i + row[:, 0].astype(np.int64)
 
-    def _relief(self, frame: int) -> Relief:
-        if frame not in self._reliefs:
-            self._reliefs[frame] = icp.relief(self._depth[frame], self._camera, self._sensor)
-            if len(self._reliefs) > KEPT:
-                self._reliefs.popitem(last=False)
-        return self._reliefs[frame]
+    def _relief(self, frame: int) -> OrientedPoints:
+        if frame not in self._frame_points:
+            self._frame_points[frame] = icp.relief(self._depth[frame], self._camera, self._sensor)
+            if len(self._frame_points) > KEPT:
+                self._frame_points.popitem(last=False)
+        return self._frame_points[frame]
 
 
 def anchor_frames(stamp: np.ndarray) -> list[int]:
@@ -244,11 +244,11 @@ def anchor_frames(stamp: np.ndarray) -> list[int]:
     return anchors
 
 
-def _explain(T: np.ndarray, source: Relief, target: Relief) -> tuple[float, float]:
+def _explain(T: np.ndarray, source: OrientedPoints, target: OrientedPoints) -> tuple[float, float]:
     return kernels.explain(T, source.xyz, source.normal, target.row, target.xyz, target.normal, target.pinhole, FLATNESS[0], FLATNESS[1])
 
 
-def _align(T: np.ndarray, source: Relief, target: Relief, known: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+def _align(T: np.ndarray, source: OrientedPoints, target: OrientedPoints, known: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
     """Move the source's surface onto the target's, all surface counting alike; `known` as in icp.align."""
     T = np.array(T, dtype=np.float64, order="C")
     H, b = np.zeros((6, 6)), np.zeros(6)
@@ -257,11 +257,11 @@ def _align(T: np.ndarray, source: Relief, target: Relief, known: tuple[np.ndarra
         T, source.xyz, source.normal, _variance(source), target.row, target.xyz, target.normal, _variance(target), target.pinhole,
         SCHEDULE, icp.MIN_COSINE, icp.HUBER_CHI2, icp.READINGS_AS_ONE, np.ascontiguousarray(known[1]), pull, H, b,
     )  # fmt: skip
-    return se3.orthonormalise(T)
+    return se3.orthonormalize(T)
 
 
-def _variance(relief: Relief) -> np.ndarray:
-    """Give readings (N,) weights as of the surface that they stand for, which grows with the square of the distance."""
+def _variance(relief: OrientedPoints) -> np.ndarray:
+    """Return readings (N,) weights as of the surface that they stand for, which grows with the square of the distance."""
     z = relief.xyz[:, 2]
     sigma = np.sqrt(relief.variance) + np.float32(0.005)
     return np.square(sigma) * np.float32(NEAR_VARIANCE) / np.square(np.minimum(z, np.float32(FAR)))

@@ -11,7 +11,7 @@ from slamcli.slam.depth_tracking import Placement, Shape
 from slamcli.slam.frame_poses import FramePoses
 from slamcli.slam.local_map import LocalMap, MapMatch
 from slamcli.sparse_map.guided_matching import FrameFeatures
-from slamcli.sparse_map.sparse_map import MapBuilder
+from slamcli.sparse_map.sparse_map import SparseMap
 
 SEARCH_KEY_FRAMES = 3  # around, that a frame is aligned with when its reference key frame does not do
 FEW = 10  # landmarks that help depth; fewer are found anywhere
@@ -34,7 +34,7 @@ class DepthLocalizer:
 
     def __init__(
         self,
-        builder: MapBuilder,
+        sparse_map: SparseMap,
         poses: FramePoses,
         shape: Shape,
         local_map: LocalMap,
@@ -47,7 +47,7 @@ class DepthLocalizer:
         make_reference : asked for a further key frame, nearer to frame i, where the reference of the frame before does not determine
             all directions of motion; it returns that key frame, None where there is none to be had
         """
-        self._builder, self._poses, self._shape, self._local_map = builder, poses, shape, local_map
+        self._sparse_map, self._poses, self._shape, self._local_map = sparse_map, poses, shape, local_map
         self._settings, self._make_reference = settings, make_reference
 
     def locate(self, i: int, frame: FrameFeatures, found: MapMatch | None) -> DepthMatch | None:
@@ -66,7 +66,7 @@ class DepthLocalizer:
         is_anchored = placed.n_determined == 6
         if not is_anchored:
             poses.lost_reason[i] = f"the depth shows {placed.n_determined} of 6 directions only: a flat wall"
-            if found is not None or stamp[i] - stamp[poses.anchored] > self._settings.shape_hold:
+            if found is not None or stamp[i] - stamp[poses.anchored] > self._settings.depth_icp_hold:
                 return None
             placed = self._shape.place(i, placed.kf, [expected], (expected, STEADY))
             if placed is None or not placed.is_sound:
@@ -116,7 +116,7 @@ class DepthLocalizer:
 
     def _match_few(self, frame: FrameFeatures, placed: Placement) -> MapMatch | None:
         """Search the frame for the landmarks around the key frame it was aligned with; None where fewer than a few agree, or depth does not."""
-        around = self._builder.landmarks_in(np.append(self._builder.joined_by_edges(np.array([placed.kf])), placed.kf))
+        around = self._sparse_map.landmarks_in(np.append(self._sparse_map.joined_by_edges(np.array([placed.kf])), placed.kf))
         if len(around) == 0 or len(frame) < FEW:
             return None
         found = self._local_map.match(frame, placed.T_cw, around, wanted=FEW)

@@ -9,15 +9,15 @@ import numpy as np
 
 from slamcli.config.options import SensorConfig
 from slamcli.depth import icp
-from slamcli.depth.icp import Alignment, Relief
+from slamcli.depth.icp import Alignment, OrientedPoints
 from slamcli.geometry import se3
 from slamcli.geometry.camera import Camera
 from slamcli.parallel import ordered_map
 from slamcli.schema import CoarseDepth
-from slamcli.sparse_map.sparse_map import MapBuilder
+from slamcli.sparse_map.sparse_map import SparseMap
 
 LEAST_POINTS = 0.05  # share of the coarse pixels that must show a surface
-KEPT = 48  # reliefs, of half a megabyte each
+KEPT = 48  # frame_points, of half a megabyte each
 MIN_AGREEMENT = 0.6  # of the points that meet: less, and it is another place, or the start was too far off
 MIN_OVERLAP = 0.15  # of the points of a key frame, that a frame must still show
 FIT_CHI2 = 50.0  # three times the 99 % quantile of six directions: shape's information is a guess
@@ -26,21 +26,21 @@ JOIN_M, JOIN_COSINE = 1.2, 0.6  # key frames farther apart, or turned by more, a
 JOIN_MOST = 5  # edges of a new key frame to earlier ones: more of them hold down the drift of a chain
 
 
-class Reliefs:
-    """The reliefs of a recording's frames; those used last are kept. Several threads may ask at once."""
+class FramePoints:
+    """The frame_points of a recording's frames; those used last are kept. Several threads may ask at once."""
 
     def __init__(self, depth: CoarseDepth, given: Camera, sensor: SensorConfig, *, camera: Camera | None = None) -> None:
         """Take the coarse depth images, read under the calibration `given`; camera : what is known of the camera, if more."""
         self._depth, self._given, self._camera, self._sensor = depth, given, camera or given, sensor
-        self._kept: OrderedDict[int, Relief | None] = OrderedDict()
+        self._kept: OrderedDict[int, OrientedPoints | None] = OrderedDict()
         self._lock = Lock()
 
-    def under(self, camera: Camera) -> "Reliefs":
-        """Give the reliefs as they are under another calibration of the same camera."""
-        return self if camera == self._camera else Reliefs(self._depth, self._given, self._sensor, camera=camera)
+    def under(self, camera: Camera) -> "FramePoints":
+        """Return the frame_points as they are under another calibration of the same camera."""
+        return self if camera == self._camera else FramePoints(self._depth, self._given, self._sensor, camera=camera)
 
-    def of(self, frame: int) -> Relief | None:
-        """Give the relief of a frame, None where it shows too little."""
+    def of(self, frame: int) -> OrientedPoints | None:
+        """Return the relief of a frame, None where it shows too little."""
         with self._lock:
             if frame in self._kept:
                 self._kept.move_to_end(frame)
@@ -52,7 +52,7 @@ class Reliefs:
                 self._kept.popitem(last=False)
         return found
 
-    def _make(self, frame: int) -> Relief | None:
+    def _make(self, frame: int) -> OrientedPoints | None:
         images = self._depth.coarse_depth
         if not 0 <= frame < len(images) or not images[frame].any():
             return None
@@ -60,21 +60,21 @@ class Reliefs:
         return relief if len(relief) >= LEAST_POINTS * relief.row.size else None
 
 
-class NoReliefs(Reliefs):
+class NoFramePoints(FramePoints):
     """Of a recording whose depth images are not looked at."""
 
     def __init__(self) -> None:
         """Take nothing."""
 
     def of(self, frame: int) -> None:
-        """Give no relief."""
+        """Return no relief."""
 
-    def under(self, camera: Camera) -> "NoReliefs":
-        """Give these."""
+    def under(self, camera: Camera) -> "NoFramePoints":
+        """Return these."""
         return self
 
 
-NO_RELIEFS = NoReliefs()
+NO_FRAME_POINTS = NoFramePoints()
 
 
 @dataclass(frozen=True)
@@ -100,19 +100,19 @@ class Placement:
 class Shape:
     """Places frames by aligning their depth images with those of key frames."""
 
-    def __init__(self, builder: MapBuilder, map_reliefs: Reliefs, reliefs: Reliefs) -> None:
-        """Take the map with the reliefs of the recording it is of, and those of the recording whose frames are placed."""
-        self._builder, self._map_reliefs, self._reliefs = builder, map_reliefs, reliefs
+    def __init__(self, sparse_map: SparseMap, map_frame_points: FramePoints, frame_points: FramePoints) -> None:
+        """Take the map with the frame_points of the recording it is of, and those of the recording whose frames are placed."""
+        self._sparse_map, self._map_frame_points, self._frame_points = sparse_map, map_frame_points, frame_points
 
     def place(self, frame: int, kf: int, starts: list[np.ndarray], known: tuple[np.ndarray, np.ndarray] | None = None) -> Placement | None:
         """Align a frame with key frame `kf` from the first of the poses `starts` (T_cw) that leads to a sound placement.
 
         known : a pose T_cw (4, 4) and the information (6, 6) of its left twist, as landmarks give. None where depth is missing.
         """
-        target, source = self._reliefs.of(frame), self._map_reliefs.of(int(self._builder.kf.frame[kf]))
+        target, source = self._frame_points.of(frame), self._map_frame_points.of(int(self._sparse_map.kf.frame[kf]))
         if target is None or source is None:
             return None
-        T_wk = self._builder.kf.T_wk[kf]
+        T_wk = self._sparse_map.kf.T_wk[kf]
         besides = None if known is None else (known[0] @ T_wk, known[1])
         placement = None
         for T_cw in starts:
@@ -127,12 +127,12 @@ class Shape:
 
     def has_depth(self, frame: int) -> bool:
         """Say whether a frame's depth image shows enough to be aligned."""
-        return self._reliefs.of(frame) is not None
+        return self._frame_points.of(frame) is not None
 
     def fixes_all(self, frame: int) -> bool:
         """Say whether the shape that a frame shows determines all directions of motion, so that a map can begin with it."""
         # Not by itself: the errors of its normals would agree, and a wall would seem rough.
-        here, there = self._reliefs.of(frame), self._reliefs.of(frame + 1) or self._reliefs.of(frame - 1)
+        here, there = self._frame_points.of(frame), self._frame_points.of(frame + 1) or self._frame_points.of(frame - 1)
         if here is None or there is None:
             return False
         found = icp.align(np.eye(4), here, there)
@@ -141,7 +141,7 @@ class Shape:
     def join(self, kf: int) -> int:
         """Add edges between a key frame and the earlier ones around that show the same; returns how many."""
         n = 0
-        table = self._builder.kf
+        table = self._sparse_map.kf
         around = self.around(table.T_wk[kf], int(table.segment[kf]))
         for other in around[around < kf]:
             n += self.join_pair(kf, int(other))
@@ -154,14 +154,14 @@ class Shape:
 
         T_cd : (K, 4, 4) each key frame's camera when its depth was measured, to its camera when colour was; workers : threads
         """
-        joined = set(map(tuple, self._builder.edge.kf.tolist()))
+        joined = set(map(tuple, self._sparse_map.edge.kf.tolist()))
 
         def edges(kf: int) -> list[tuple | None]:
-            neighbours, shared = self._builder.covisible(kf)
+            neighbours, shared = self._sparse_map.covisible(kf)
             others = neighbours[(neighbours < kf) & (shared >= least)][:most].tolist()
             return [self._edge(kf, other, T_cd) for other in others if (kf, other) not in joined]
 
-        found = chain.from_iterable(ordered_map(edges, range(1, len(self._builder.kf)), workers=workers))
+        found = chain.from_iterable(ordered_map(edges, range(1, len(self._sparse_map.kf)), workers=workers))
         return sum(self._add(edge) for edge in list(found))
 
     def join_pair(self, kf_i: int, kf_j: int, T_cd: np.ndarray | None = None) -> bool:
@@ -169,10 +169,10 @@ class Shape:
         return self._add(self._edge(kf_i, kf_j, T_cd))
 
     def _edge(self, kf_i: int, kf_j: int, T_cd: np.ndarray | None) -> tuple[int, int, np.ndarray, np.ndarray] | None:
-        """Find the edge between two key frames, as `MapBuilder.add_edge` takes it; None where their depth images determine none."""
-        table = self._builder.kf
+        """Find the edge between two key frames, as `SparseMap.add_edge` takes it; None where their depth images determine none."""
+        table = self._sparse_map.kf
         T_i, T_j = (np.eye(4) if T_cd is None else T_cd[kf] for kf in (kf_i, kf_j))
-        target, source = (self._map_reliefs.of(int(table.frame[kf])) for kf in (kf_i, kf_j))
+        target, source = (self._map_frame_points.of(int(table.frame[kf])) for kf in (kf_i, kf_j))
         if target is None or source is None:
             return None
         found = icp.align(se3.inverse(table.T_wk[kf_i] @ T_i) @ table.T_wk[kf_j] @ T_j, source, target)
@@ -183,12 +183,12 @@ class Shape:
 
     def _add(self, edge: tuple[int, int, np.ndarray, np.ndarray] | None) -> bool:
         if edge is not None:
-            self._builder.add_edge(*edge)
+            self._sparse_map.add_edge(*edge)
         return edge is not None
 
     def around(self, T_wc: np.ndarray, segment: int) -> np.ndarray:
-        """Give the key frames of a segment that stand and look nearly as a camera at T_wc does, nearest first."""
-        table = self._builder.kf
+        """Return the key frames of a segment that stand and look nearly as a camera at T_wc does, nearest first."""
+        table = self._sparse_map.kf
         apart = np.linalg.norm(table.T_wk[:, :3, 3] - T_wc[:3, 3], axis=1)
         cosine = table.T_wk[:, :3, 2] @ T_wc[:3, 2]
         near = np.flatnonzero((table.segment == segment) & (apart < JOIN_M) & (cosine > JOIN_COSINE))

@@ -24,7 +24,7 @@ class Finding:
 
 
 def to_summary(findings: Iterable[Finding]) -> dict[str, Any]:
-    """Give the part of a stage's summary that keeps findings; nothing where there are none."""
+    """Return the part of a stage's summary that keeps findings; nothing where there are none."""
     found = [asdict(finding) for finding in findings]
     return {DOUBTS: found} if found else {}
 

@@ -13,54 +13,54 @@ from slamcli.estimation.camera_pose import PoseEstimate
 from slamcli.geometry import se3
 from slamcli.geometry.camera import Camera
 from slamcli.parallel import ordered_map
-from slamcli.schema import KEY_FRAME, LOST, ON_SHAPE, RELOCALISED, Features, Tracks
-from slamcli.slam.depth_tracking import Reliefs, Shape
+from slamcli.schema import KEY_FRAME, LOST, ON_DEPTH, RELOCALIZED, Features, Tracks
+from slamcli.slam.depth_tracking import FramePoints, Shape
 from slamcli.sparse_map import guided_matching, map_adjustment
 from slamcli.sparse_map.frame import frame_features, refine_on_landmarks
-from slamcli.sparse_map.sparse_map import MapBuilder
+from slamcli.sparse_map.sparse_map import SparseMap
 
 SHARED = 30  # landmarks of two key frames whose depth images are aligned too
 NEIGHBOURS = 20  # covisible key frames whose landmarks are looked for
 LOST_WIDENING = 8.0  # a lost frame's neighbour stands where a frame's fast turn leaves it, some tens of pixels off
 
 
-def look_again(
-    builder: MapBuilder,
+def refine_all(
+    sparse_map: SparseMap,
     tracks: Tracks,
     sensing: Sensing,
     sensor: SensorConfig,
     settings: TrackConfig,
     *,
-    reliefs: Reliefs,
-    shape_edges: int,
-    shape_weight: float = 1.0,
+    frame_points: FramePoints,
+    depth_icp_edges: int,
+    depth_icp_weight: float = 1.0,
     iterations: int,
     progress,
     workers: int = 1,
 ) -> tuple[Tracks, BundleResult | None]:
-    """Align each key frame's depth image with those of up to `shape_edges` covisible ones, adjust the map, refine every frame against it.
+    """Align each key frame's depth image with those of up to `depth_icp_edges` covisible ones, adjust the map, refine every frame against it.
 
-    builder : its map is changed; its features are those that `sensing` corrected
-    reliefs : of the recording, of which depth images are taken; shape_weight : factor on what they say in the adjustment
+    sparse_map : its map is changed; its features are those that `sensing` corrected
+    frame_points : of the recording, of which depth images are taken; depth_icp_weight : factor on what they say in the adjustment
     workers : threads; the result is the same with any number
     Returns the refined tracks, and the evidence of the adjustment, None where nothing ties two key frames together.
     """
-    if shape_edges:
-        T_cd = rolling_shutter.depth_to_colour(builder.features, sensing.timing, builder.kf.frame)
-        reliefs = reliefs.under(sensing.camera)
-        Shape(builder, reliefs, reliefs).join_covisible(T_cd, most=shape_edges, least=SHARED, workers=workers)
-    kfs = np.arange(len(builder.kf), dtype=np.int32)
-    result = map_adjustment.adjust(builder, kfs, sensing.camera, sensor, max_iterations=iterations, edge_weight=shape_weight)
-    tracks = refine_frames(builder, builder.features, tracks, sensing.camera, sensor, settings, progress, workers=workers)
-    return move_key_frames(builder, tracks), result
+    if depth_icp_edges:
+        T_cd = rolling_shutter.depth_to_colour(sparse_map.features, sensing.timing, sparse_map.kf.frame)
+        frame_points = frame_points.under(sensing.camera)
+        Shape(sparse_map, frame_points, frame_points).join_covisible(T_cd, most=depth_icp_edges, least=SHARED, workers=workers)
+    kfs = np.arange(len(sparse_map.kf), dtype=np.int32)
+    result = map_adjustment.adjust(sparse_map, kfs, sensing.camera, sensor, max_iterations=iterations, edge_weight=depth_icp_weight)
+    tracks = refine_frames(sparse_map, sparse_map.features, tracks, sensing.camera, sensor, settings, progress, workers=workers)
+    return move_key_frames(sparse_map, tracks), result
 
 
-def move_key_frames(builder: MapBuilder, tracks: Tracks) -> Tracks:
+def move_key_frames(sparse_map: SparseMap, tracks: Tracks) -> Tracks:
     """Move each key frame to where its frame stands, landmarks staying, and hang all frames on the key frames again.
 
     The oldest key frame of each segment is its world's origin: instead of it, all else moves.
     """
-    table, has_pose = builder.kf, tracks.ref_kf >= 0
+    table, has_pose = sparse_map.kf, tracks.ref_kf >= 0
     ref, T_wc = tracks.ref_kf[has_pose], np.full(tracks.T_kc.shape, np.nan)
     T_wc[has_pose] = table.T_wk[ref] @ tracks.T_kc[has_pose]
     for oldest in np.unique(table.segment, return_index=True)[1]:
@@ -68,8 +68,8 @@ def move_key_frames(builder: MapBuilder, tracks: Tracks) -> Tracks:
         is_here = table.segment == table.segment[oldest]
         frames = np.flatnonzero(has_pose)[is_here[ref]]
         T_wc[frames] = shift @ T_wc[frames]
-        ids = np.flatnonzero(builder.lm.is_alive & is_here[builder.lm.first_kf])
-        builder.lm.xyz[ids] = se3.transform(shift, builder.lm.xyz[ids])
+        ids = np.flatnonzero(sparse_map.lm.is_alive & is_here[sparse_map.lm.first_kf])
+        sparse_map.lm.xyz[ids] = se3.transform(shift, sparse_map.lm.xyz[ids])
     table.T_wk[:] = T_wc[table.frame]
     T_kc = np.full(T_wc.shape, np.nan)
     T_kc[has_pose] = se3.inverse(table.T_wk[ref]) @ T_wc[has_pose]
@@ -78,7 +78,7 @@ def move_key_frames(builder: MapBuilder, tracks: Tracks) -> Tracks:
 
 
 def refine_frames(
-    builder: MapBuilder,
+    sparse_map: SparseMap,
     features: Features,
     tracks: Tracks,
     camera: Camera,
@@ -94,10 +94,10 @@ def refine_frames(
     A frame keeps its pose where much fewer landmarks agree than before, and a key frame also where so few do that shape held it.
     Returns new Tracks; the map stays as it is.
     """
-    look = _Look(builder, features, tracks, camera, sensor, settings)
+    look = _Look(sparse_map, features, tracks, camera, sensor, settings)
     n = len(tracks.state)
     # The few landmarks around a frame on shape would make its pose worse.
-    chosen = np.flatnonzero((tracks.state != LOST) & (tracks.state != ON_SHAPE))
+    chosen = np.flatnonzero((tracks.state != LOST) & (tracks.state != ON_DEPTH))
     # No frame depends on another; those that follow one another on one key frame share the landmarks around it.
     spans = np.split(chosen, np.flatnonzero(np.diff(tracks.ref_kf[chosen])) + 1)
     refined = ordered_map(look.again, spans, workers=workers)
@@ -110,7 +110,7 @@ def refine_frames(
             is_open = look.state[i] == LOST and 0 <= j < n and look.ref_kf[j] >= 0
             if is_open and look.place(i, look.T_wc[j], int(look.ref_kf[j]), widening=LOST_WIDENING):
                 look.place(i, look.T_wc[i], int(look.ref_kf[i]))
-                look.state[i] = RELOCALISED
+                look.state[i] = RELOCALIZED
     return Tracks(ref_kf=look.ref_kf, T_kc=look.T_kc, state=look.state, n_inliers=look.n_inliers)
 
 
@@ -118,12 +118,12 @@ class _Look:
     """The second look at frames, and what it found."""
 
     def __init__(
-        self, builder: MapBuilder, features: Features, tracks: Tracks, camera: Camera, sensor: SensorConfig, settings: TrackConfig
+        self, sparse_map: SparseMap, features: Features, tracks: Tracks, camera: Camera, sensor: SensorConfig, settings: TrackConfig
     ) -> None:
-        self.builder, self.features, self.camera, self.sensor, self.settings = builder, features, camera, sensor, settings
+        self.sparse_map, self.features, self.camera, self.sensor, self.settings = sparse_map, features, camera, sensor, settings
         self.T_wc = np.full(tracks.T_kc.shape, np.nan)  # each in the world of its segment
         has_pose = tracks.ref_kf >= 0
-        self.T_wc[has_pose] = builder.kf.T_wk[tracks.ref_kf[has_pose]] @ tracks.T_kc[has_pose]
+        self.T_wc[has_pose] = sparse_map.kf.T_wk[tracks.ref_kf[has_pose]] @ tracks.T_kc[has_pose]
         self.ref_kf, self.T_kc = tracks.ref_kf.copy(), tracks.T_kc.copy()
         self.state, self.n_inliers = tracks.state.copy(), tracks.n_inliers.copy()
 
@@ -133,7 +133,7 @@ class _Look:
             return []
         landmarks, found = self._landmarks_around(int(self.ref_kf[span[0]])), []
         for i in span.tolist():
-            least = self.settings.shape_below if self.state[i] == KEY_FRAME else 0
+            least = self.settings.depth_icp_below if self.state[i] == KEY_FRAME else 0
             found.append((i, self._find(i, self.T_wc[i], landmarks, least=least)))
         return found
 
@@ -151,7 +151,7 @@ class _Look:
         """Note where frame `i` was found, relative to key frame `kf`."""
         self.ref_kf[i], self.n_inliers[i] = kf, estimate.n_inliers
         self.T_wc[i] = se3.inverse(estimate.T_cw)
-        self.T_kc[i] = se3.inverse(estimate.T_cw @ self.builder.kf.T_wk[kf])
+        self.T_kc[i] = se3.inverse(estimate.T_cw @ self.sparse_map.kf.T_wk[kf])
 
     def _find(
         self, i: int, T_wc: np.ndarray, landmarks: guided_matching.Candidates, *, widening: float = 1.0, least: int = 0
@@ -164,7 +164,7 @@ class _Look:
             landmarks,
             frame,
             self.camera,
-            octave_scale=self.builder.octave_scale,
+            octave_scale=self.sparse_map.octave_scale,
             radius_px=widening * self.settings.search_radius_px,
             max_distance=self.settings.search_max_distance,
             ratio=self.settings.search_ratio,
@@ -176,5 +176,5 @@ class _Look:
         return estimate if estimate.n_inliers >= wanted else None
 
     def _landmarks_around(self, kf: int) -> guided_matching.Candidates:
-        neighbours, _ = self.builder.covisible(kf)
-        return self.builder.candidates(self.builder.landmarks_in(np.append(neighbours[:NEIGHBOURS], kf)))
+        neighbours, _ = self.sparse_map.covisible(kf)
+        return self.sparse_map.candidates(self.sparse_map.landmarks_in(np.append(neighbours[:NEIGHBOURS], kf)))

@@ -4,7 +4,7 @@ import numpy as np
 
 from slamcli.geometry import se3
 from slamcli.schema import KEY_FRAME, LOST, Tracks
-from slamcli.sparse_map.sparse_map import MapBuilder
+from slamcli.sparse_map.sparse_map import SparseMap
 
 STEADY_REACH = 4.0  # times the last step in time over which the motion is taken to go on: a gap says nothing about the motion within it
 
@@ -15,14 +15,14 @@ class FramePoses:
     latest : the last frame with a pose; anchored : the last one of which every direction of motion was measured (-1 before the first)
     """
 
-    def __init__(self, builder: MapBuilder, stamp: np.ndarray, background: np.ndarray | None = None) -> None:
+    def __init__(self, sparse_map: SparseMap, stamp: np.ndarray, background: np.ndarray | None = None) -> None:
         """Begin with every frame lost.
 
         stamp : (F,) [s]
         background : (F, 4, 4) T_wc that drift, but whose motion from frame to frame is right, where it is known beforehand
         """
         n = len(stamp)
-        self._kf = builder.kf
+        self._kf = sparse_map.kf
         self.stamp, self._background = stamp, background
         self.ref_kf = np.full(n, -1, dtype=np.int32)
         self.T_kc = np.full((n, 4, 4), np.nan)

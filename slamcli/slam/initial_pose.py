@@ -11,7 +11,7 @@ from slamcli.geometry.camera import Camera
 from slamcli.schema import Matches
 from slamcli.sparse_map.frame import refine_on_landmarks
 from slamcli.sparse_map.guided_matching import FrameFeatures
-from slamcli.sparse_map.sparse_map import MapBuilder
+from slamcli.sparse_map.sparse_map import SparseMap
 
 
 @dataclass(frozen=True)
@@ -29,9 +29,9 @@ class Correspondences:
 class PreviousFrame:
     """The frame before, with the landmarks that it showed: what the next one is matched with."""
 
-    def __init__(self, builder: MapBuilder, matches: Matches, camera: Camera) -> None:
+    def __init__(self, sparse_map: SparseMap, matches: Matches, camera: Camera) -> None:
         """Take the matches between neighbouring frames."""
-        self._builder, self._matches, self._camera = builder, matches, camera
+        self._sparse_map, self._matches, self._camera = sparse_map, matches, camera
         self._pair_of = {(int(i), int(j)): p for p, (i, j) in enumerate(matches.pair)}
         self.features: FrameFeatures | None = None
         self.landmark = np.empty(0, dtype=np.int32)  # of each of its features, -1 = none
@@ -49,9 +49,9 @@ class PreviousFrame:
         if pair is None or self.features is None:
             return Correspondences(np.empty(0, np.int32), np.empty((0, 3)), np.empty(0, np.int32))
         match = self._matches.row[self._matches.offset[pair] : self._matches.offset[pair + 1]]
-        ids = self._builder.resolve(self.landmark[match[:, 1]])
+        ids = self._sparse_map.resolve(self.landmark[match[:, 1]])
         x_w = se3.transform(T_wp, self._camera.backproject(self.features.xy[match[:, 1]], self.features.depth[match[:, 1]]))
-        x_w[ids >= 0] = self._builder.lm.xyz[ids[ids >= 0]]
+        x_w[ids >= 0] = self._sparse_map.lm.xyz[ids[ids >= 0]]
         is_usable = np.isfinite(x_w[:, 0])
         return Correspondences(match[is_usable, 0], x_w[is_usable], ids[is_usable])
 

@@ -7,10 +7,10 @@ import numpy as np
 
 from slamcli.config.options import SensorConfig, TrackConfig
 from slamcli.geometry.camera import Camera
-from slamcli.schema import ON_SHAPE, RELOCALISED, TRACKED, Features, Matches, Tracks, Words
+from slamcli.schema import ON_DEPTH, RELOCALIZED, TRACKED, Features, Matches, Tracks, Words
 from slamcli.slam import initial_pose
 from slamcli.slam.depth_localization import DepthLocalizer
-from slamcli.slam.depth_tracking import NO_RELIEFS, Placement, Reliefs, Shape
+from slamcli.slam.depth_tracking import NO_FRAME_POINTS, FramePoints, Placement, Shape
 from slamcli.slam.frame_poses import FramePoses
 from slamcli.slam.initial_pose import PreviousFrame
 from slamcli.slam.local_map import LocalMap, MapMatch
@@ -18,7 +18,7 @@ from slamcli.slam.place_recognition import PlaceIndex
 from slamcli.slam.relocalization import Relocalizer
 from slamcli.sparse_map.frame import frame_features
 from slamcli.sparse_map.guided_matching import FrameFeatures
-from slamcli.sparse_map.sparse_map import MapBuilder
+from slamcli.sparse_map.sparse_map import SparseMap
 
 
 def no_reference(i: int) -> None:
@@ -41,7 +41,7 @@ class Localizer:
 
     def __init__(
         self,
-        builder: MapBuilder,
+        sparse_map: SparseMap,
         places: PlaceIndex,
         features: Features,
         words: Words,
@@ -51,24 +51,24 @@ class Localizer:
         sensor: SensorConfig,
         rng: np.random.Generator,
         *,
-        reliefs: Reliefs = NO_RELIEFS,
-        map_reliefs: Reliefs = NO_RELIEFS,
+        frame_points: FramePoints = NO_FRAME_POINTS,
+        map_frame_points: FramePoints = NO_FRAME_POINTS,
         background: np.ndarray | None = None,
         make_reference: Callable[[int], int | None] = no_reference,
     ) -> None:
         """Take the map with the index of its key frames, and a recording's features, words and matches of neighbouring frames.
 
-        reliefs, map_reliefs : of that recording, and of the one that the map is of; without them, texture alone is followed
+        frame_points, map_frame_points : of that recording, and of the one that the map is of; without them, texture alone is followed
         background : see FramePoses; make_reference : see DepthLocalizer
         """
-        self._builder, self._features, self._camera = builder, features, camera
+        self._sparse_map, self._features, self._camera = sparse_map, features, camera
         self._settings, self._sensor, self._rng = settings, sensor, rng
-        self.poses = FramePoses(builder, features.stamp, background)
-        self.previous = PreviousFrame(builder, matches, camera)
-        self.shape = Shape(builder, map_reliefs, reliefs)
-        self._local_map = LocalMap(builder, camera, settings)
-        self._by_depth = DepthLocalizer(builder, self.poses, self.shape, self._local_map, settings, make_reference=make_reference)
-        self._relocalizer = Relocalizer(builder, places, words, camera, settings, rng)
+        self.poses = FramePoses(sparse_map, features.stamp, background)
+        self.previous = PreviousFrame(sparse_map, matches, camera)
+        self.shape = Shape(sparse_map, map_frame_points, frame_points)
+        self._local_map = LocalMap(sparse_map, camera, settings)
+        self._by_depth = DepthLocalizer(sparse_map, self.poses, self.shape, self._local_map, settings, make_reference=make_reference)
+        self._relocalizer = Relocalizer(sparse_map, places, words, camera, settings, rng)
 
     def process(self, i: int) -> None:
         """Find the pose of frame `i`; frames come in order."""
@@ -88,16 +88,16 @@ class Localizer:
         """Find the pose of frame `i` and record it; None, and the reason recorded, where it is lost."""
         sees_enough, state = len(frame) >= self._settings.min_inliers, TRACKED
         found = self._follow(i, frame) if sees_enough else None
-        if found is None or found.estimate.n_inliers < self._settings.shape_below:
+        if found is None or found.estimate.n_inliers < self._settings.depth_icp_below:
             location = self._locate_by_depth(i, frame, found)
             if location is not None:
                 return location
         if found is None and sees_enough:
-            found, state = self._relocalize(i, frame), RELOCALISED
+            found, state = self._relocalize(i, frame), RELOCALIZED
         if found is None:
             self.poses.lost_reason.setdefault(i, self._why_lost(frame))
             return None
-        kf = int(np.argmax(self._builder.votes(found.landmark[found.landmark >= 0])))
+        kf = int(np.argmax(self._sparse_map.votes(found.landmark[found.landmark >= 0])))
         self.poses.attach(i, kf, found.estimate.T_cw, state=state, n_inliers=found.estimate.n_inliers)
         return Location(found.landmark, None)
 
@@ -113,21 +113,21 @@ class Localizer:
 
     def _still_known(self, i: int, ids: np.ndarray) -> np.ndarray:
         """List those of `ids` that still are landmarks; where none is, all of the reference key frame of the frame before `i`."""
-        ids = self._builder.resolve(ids)
+        ids = self._sparse_map.resolve(ids)
         ids = ids[ids >= 0]
-        return ids if len(ids) else self._builder.landmarks_of(int(self.poses.ref_kf[i - 1]))
+        return ids if len(ids) else self._sparse_map.landmarks_of(int(self.poses.ref_kf[i - 1]))
 
     def _locate_by_depth(self, i: int, frame: FrameFeatures, found: MapMatch | None) -> Location | None:
         placed = self._by_depth.locate(i, frame, found)
         if placed is None:
             return None
         placement, n_inliers = placed.placement, int((placed.landmark >= 0).sum())
-        self.poses.attach(i, placement.kf, placement.T_cw, state=ON_SHAPE, n_inliers=n_inliers, is_anchored=placed.is_anchored)
+        self.poses.attach(i, placement.kf, placement.T_cw, state=ON_DEPTH, n_inliers=n_inliers, is_anchored=placed.is_anchored)
         return Location(placed.landmark, placement)
 
     def _relocalize(self, i: int, frame: FrameFeatures) -> MapMatch | None:
         place = self._relocalizer.find(i, frame)
-        return None if place is None else self._local_map.match(frame, *place, wanted=self._settings.relocalise_inliers)
+        return None if place is None else self._local_map.match(frame, *place, wanted=self._settings.relocalize_inliers)
 
     def _why_lost(self, frame: FrameFeatures) -> str:
         if len(frame) < self._settings.min_inliers:

@@ -1,4 +1,4 @@
-"""Loop closing: places seen again are recognised, verified, and pulled together."""
+"""Loop closing: places seen again are recognized, verified, and pulled together."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -14,7 +14,7 @@ from slamcli.slam.place_recognition import PlaceIndex
 from slamcli.sparse_map import guided_matching, map_adjustment
 from slamcli.sparse_map.frame import frame_features, refine_on_landmarks
 from slamcli.sparse_map.landmark_fusion import fuse_landmarks
-from slamcli.sparse_map.sparse_map import MapBuilder
+from slamcli.sparse_map.sparse_map import SparseMap
 from slamcli.vision import hamming
 
 # Between neighbours that share 100 landmarks [m, rad]. In simulated rooms the drift over 20 to 50 key frames is a fourth to an eighth of
@@ -45,12 +45,12 @@ class Candidate:
         return not self.reason
 
 
-def find_candidates(builder: MapBuilder, places: PlaceIndex, settings: LoopConfig) -> list[Candidate]:
-    """Give for each key frame the earlier ones that look like it and share (almost) no landmarks with it, most alike first."""
+def find_candidates(sparse_map: SparseMap, places: PlaceIndex, settings: LoopConfig) -> list[Candidate]:
+    """List pairs of key frames whose bags of words are alike but which are not covisible, most alike first."""
     candidates = []
-    for i in range(len(builder.kf)):
+    for i in range(len(sparse_map.kf)):
         scores = places.scores(i)
-        shared = builder.votes(builder.landmarks_of(i))
+        shared = sparse_map.votes(sparse_map.landmarks_of(i))
         # Each vocabulary has its own range of scores: a place seen again should look as alike as the worst of the neighbours, [ORB-SLAM].
         neighbours = np.flatnonzero(shared >= settings.min_shared)
         neighbours = neighbours[neighbours != i]
@@ -65,17 +65,17 @@ def find_candidates(builder: MapBuilder, places: PlaceIndex, settings: LoopConfi
     return sorted(candidates, key=lambda c: (-c.score, c.kf_i, c.kf_j))
 
 
-def find_near(builder: MapBuilder, places: PlaceIndex, settings: LoopConfig) -> list[Candidate]:
-    """Give for each key frame the earlier one that looks at the same spot by the poses of now, yet shares (almost) no landmarks with it, nearest first.
+def find_near(sparse_map: SparseMap, places: PlaceIndex, settings: LoopConfig) -> list[Candidate]:
+    """List pairs of key frames that view the same place according to their current poses but are not covisible, sorted by distance.
 
     Words miss such pairs when little of the two views is in common, as on either side of a gap, or when both are seen at an angle.
     """
     candidates = []
-    spot = builder.kf.T_wk[:, :3, 3] + AHEAD * builder.kf.T_wk[:, :3, 2]
-    for i in range(1, len(builder.kf)):
-        is_open = builder.votes(builder.landmarks_of(i))[:i] < settings.min_shared
-        is_open &= builder.kf.segment[:i] == builder.kf.segment[i]
-        is_open &= builder.kf.T_wk[:i, :3, 2] @ builder.kf.T_wk[i, :3, 2] > MIN_COSINE
+    spot = sparse_map.kf.T_wk[:, :3, 3] + AHEAD * sparse_map.kf.T_wk[:, :3, 2]
+    for i in range(1, len(sparse_map.kf)):
+        is_open = sparse_map.votes(sparse_map.landmarks_of(i))[:i] < settings.min_shared
+        is_open &= sparse_map.kf.segment[:i] == sparse_map.kf.segment[i]
+        is_open &= sparse_map.kf.T_wk[:i, :3, 2] @ sparse_map.kf.T_wk[i, :3, 2] > MIN_COSINE
         apart = np.where(is_open, np.linalg.norm(spot[:i] - spot[i], axis=1), np.inf)
         j = int(np.argmin(apart))
         if apart[j] < settings.near:
@@ -84,7 +84,7 @@ def find_near(builder: MapBuilder, places: PlaceIndex, settings: LoopConfig) -> 
 
 
 def verify(
-    builder: MapBuilder,
+    sparse_map: SparseMap,
     words: Words,
     candidate: Candidate,
     camera: Camera,
@@ -94,10 +94,10 @@ def verify(
 ) -> Candidate:
     """Check a candidate by geometry: 3-D to 3-D RANSAC, for a near one the poses of now; then the landmarks around j looked for in i."""
     frame_i, frame_j = (
-        frame_features(builder.features, int(builder.kf.frame[kf]), camera, sensor) for kf in (candidate.kf_i, candidate.kf_j)
+        frame_features(sparse_map.features, int(sparse_map.kf.frame[kf]), camera, sensor) for kf in (candidate.kf_i, candidate.kf_j)
     )
     if candidate.is_near:
-        return _look_again(builder, candidate, frame_i, se3.inverse(builder.kf.T_wk[candidate.kf_i]), camera, settings)
+        return _find_landmarks(sparse_map, candidate, frame_i, se3.inverse(sparse_map.kf.T_wk[candidate.kf_i]), camera, settings)
     node_i, node_j = (np.array(words.node[f.first_row : f.first_row + len(f)]) for f in (frame_i, frame_j))
     rows, _ = hamming.match_nodes(frame_i.desc.view(np.uint8), node_i, frame_j.desc.view(np.uint8), node_j, frame_i.angle, frame_j.angle)
     has_depth = np.isfinite(frame_i.depth[rows[:, 0]]) & np.isfinite(frame_j.depth[rows[:, 1]])
@@ -119,12 +119,12 @@ def verify(
     )
     if start is None:
         return replace(candidate, reason="no rigid motion explains the matches")
-    T_iw = start.T_cw @ se3.inverse(builder.kf.T_wk[candidate.kf_j])
-    return _look_again(builder, candidate, frame_i, T_iw, camera, settings)
+    T_iw = start.T_cw @ se3.inverse(sparse_map.kf.T_wk[candidate.kf_j])
+    return _find_landmarks(sparse_map, candidate, frame_i, T_iw, camera, settings)
 
 
-def _look_again(
-    builder: MapBuilder,
+def _find_landmarks(
+    sparse_map: SparseMap,
     candidate: Candidate,
     frame_i: guided_matching.FrameFeatures,
     T_iw: np.ndarray,
@@ -132,16 +132,16 @@ def _look_again(
     settings: LoopConfig,
 ) -> Candidate:
     """Look for the landmarks around j in i, from a guess of its pose T_iw in the world that j stands in."""
-    neighbours, _ = builder.covisible(candidate.kf_j)
-    ids = builder.landmarks_in(np.append(neighbours[: settings.neighbours], candidate.kf_j))
-    landmarks = builder.candidates(ids)
+    neighbours, _ = sparse_map.covisible(candidate.kf_j)
+    ids = sparse_map.landmarks_in(np.append(neighbours[: settings.neighbours], candidate.kf_j))
+    landmarks = sparse_map.candidates(ids)
     for radius in (4.0, 2.0):
         feature, _ = guided_matching.search(
             T_iw,
             landmarks,
             frame_i,
             camera,
-            octave_scale=builder.octave_scale,
+            octave_scale=sparse_map.octave_scale,
             radius_px=radius * settings.search_radius_px,
             max_distance=64,
             ratio=0.9,
@@ -154,7 +154,7 @@ def _look_again(
     candidate = replace(candidate, n_inliers=estimate.n_inliers)
     if estimate.n_inliers < settings.min_inliers:
         return replace(candidate, reason=f"{estimate.n_inliers} of {settings.min_inliers} landmarks agree")
-    return replace(candidate, T_ij=T_iw @ builder.kf.T_wk[candidate.kf_j], information=estimate.information)
+    return replace(candidate, T_ij=T_iw @ sparse_map.kf.T_wk[candidate.kf_j], information=estimate.information)
 
 
 @dataclass(frozen=True)
@@ -167,10 +167,10 @@ class PoseGraph:
     is_closure: np.ndarray  # (E,) bool
 
 
-def build_pose_graph(builder: MapBuilder, closures: list[Candidate], settings: LoopConfig) -> PoseGraph:
-    """Give the edges between covisible key frames, which hold what the map says now, followed by the closures."""
-    edge_kf, n_shared = covisibility_edges(builder, settings)
-    T_ij = se3.inverse(builder.kf.T_wk[edge_kf[:, 0]]) @ builder.kf.T_wk[edge_kf[:, 1]]
+def build_pose_graph(sparse_map: SparseMap, closures: list[Candidate], settings: LoopConfig) -> PoseGraph:
+    """Return the edges between covisible key frames, which hold what the map says now, followed by the closures."""
+    edge_kf, n_shared = covisibility_edges(sparse_map, settings)
+    T_ij = se3.inverse(sparse_map.kf.T_wk[edge_kf[:, 0]]) @ sparse_map.kf.T_wk[edge_kf[:, 1]]
     support = np.append(n_shared, [float(min(c.n_inliers, 300)) for c in closures])
     return PoseGraph(
         edge_kf=np.concatenate([edge_kf, np.array([(c.kf_i, c.kf_j) for c in closures], dtype=np.int32).reshape(-1, 2)]),
@@ -180,13 +180,13 @@ def build_pose_graph(builder: MapBuilder, closures: list[Candidate], settings: L
     )
 
 
-def close(builder: MapBuilder, closures: list[Candidate], settings: LoopConfig) -> pose_graph.PoseGraphResult:
+def close(sparse_map: SparseMap, closures: list[Candidate], settings: LoopConfig) -> pose_graph.PoseGraphResult:
     """Spread the closures' corrections over the key frames; [L] (13). Closures that the rest of the graph contradicts are dropped."""
-    graph = build_pose_graph(builder, closures, settings)
-    is_fixed = np.zeros(len(builder.kf), dtype=bool)
-    is_fixed[np.unique(builder.kf.segment, return_index=True)[1]] = True
+    graph = build_pose_graph(sparse_map, closures, settings)
+    is_fixed = np.zeros(len(sparse_map.kf), dtype=bool)
+    is_fixed[np.unique(sparse_map.kf.segment, return_index=True)[1]] = True
     return pose_graph.optimize(
-        builder.kf.T_wk, graph.edge_kf, graph.edge_T_ij, graph.information, is_fixed=is_fixed, is_robust=graph.is_closure
+        sparse_map.kf.T_wk, graph.edge_kf, graph.edge_T_ij, graph.information, is_fixed=is_fixed, is_robust=graph.is_closure
     )
 
 
@@ -230,41 +230,43 @@ def spread(candidates: list[Candidate], *, span: int) -> list[Candidate]:
 
 
 def reject(candidate: Candidate, reason: str) -> Candidate:
-    """Give the candidate as rejected."""
+    """Return the candidate as rejected."""
     return replace(candidate, reason=reason)
 
 
-def covisibility_edges(builder: MapBuilder, settings: LoopConfig) -> tuple[np.ndarray, np.ndarray]:
-    """Give pairs of key frames (E, 2) that share landmarks or a shape, and how many; neighbours in time within a segment always belong."""
+def covisibility_edges(sparse_map: SparseMap, settings: LoopConfig) -> tuple[np.ndarray, np.ndarray]:
+    """Return pairs of key frames (E, 2) that share landmarks or a shape, and how many; neighbours in time within a segment always belong."""
     edges, weights = [], []
-    for i in range(1, len(builder.kf)):
-        shared = builder.votes(builder.landmarks_of(i))[:i]
+    for i in range(1, len(sparse_map.kf)):
+        shared = sparse_map.votes(sparse_map.landmarks_of(i))[:i]
         joined = np.flatnonzero(shared >= settings.edge_shared)
-        before = np.flatnonzero(builder.kf.segment[:i] == builder.kf.segment[i])[-1:]
-        on_shape = builder.edge.kf[builder.edge.kf[:, 0] == i, 1]
-        shared[on_shape] = np.maximum(shared[on_shape], SHAPE_SUPPORT)
-        joined = np.union1d(joined[np.argsort(-shared[joined], kind="stable")[: settings.edges_per_key_frame]], np.append(before, on_shape))
+        before = np.flatnonzero(sparse_map.kf.segment[:i] == sparse_map.kf.segment[i])[-1:]
+        on_depth = sparse_map.edge.kf[sparse_map.edge.kf[:, 0] == i, 1]
+        shared[on_depth] = np.maximum(shared[on_depth], SHAPE_SUPPORT)
+        joined = np.union1d(joined[np.argsort(-shared[joined], kind="stable")[: settings.edges_per_key_frame]], np.append(before, on_depth))
         edges += [(i, int(j)) for j in joined]
         weights += [max(int(shared[j]), 1) for j in joined]
     return np.array(edges, dtype=np.int32).reshape(-1, 2), np.array(weights, dtype=np.float64)
 
 
-def apply(builder: MapBuilder, T_wk: np.ndarray) -> None:
+def apply(sparse_map: SparseMap, T_wk: np.ndarray) -> None:
     """Move the key frames to `T_wk` and every landmark along with the key frame that created it."""
-    before = builder.kf.T_wk.copy()
-    builder.kf.T_wk[:] = T_wk
-    alive = np.flatnonzero(builder.lm.is_alive).astype(np.int32)
-    map_adjustment.carry(builder, alive, np.arange(len(builder.kf)), before)
+    before = sparse_map.kf.T_wk.copy()
+    sparse_map.kf.T_wk[:] = T_wk
+    alive = np.flatnonzero(sparse_map.lm.is_alive).astype(np.int32)
+    map_adjustment.carry(sparse_map, alive, np.arange(len(sparse_map.kf)), before)
 
 
-def fuse_around(builder: MapBuilder, closure: Candidate, camera: Camera, settings: LoopConfig, sensor: SensorConfig) -> int:
+def fuse_around(sparse_map: SparseMap, closure: Candidate, camera: Camera, settings: LoopConfig, sensor: SensorConfig) -> int:
     """Find each side's landmarks in the key frames of the other side; returns how many were joined."""
     sides = []
     for kf in (closure.kf_i, closure.kf_j):
-        neighbours, shared = builder.covisible(kf)
+        neighbours, shared = sparse_map.covisible(kf)
         sides.append(np.append(neighbours[shared >= settings.edge_shared][: settings.neighbours], kf))
     n = 0
     for here, there in (sides, sides[::-1]):
         for kf in here:
-            n += fuse_landmarks(builder, int(kf), builder.landmarks_in(there), camera, sensor, max_distance=settings.fuse_max_distance)
+            n += fuse_landmarks(
+                sparse_map, int(kf), sparse_map.landmarks_in(there), camera, sensor, max_distance=settings.fuse_max_distance
+            )
     return n

@@ -8,7 +8,7 @@ from slamcli.geometry.camera import Camera
 from slamcli.sparse_map import map_adjustment
 from slamcli.sparse_map.guided_matching import FrameFeatures
 from slamcli.sparse_map.landmark_fusion import fuse_landmarks
-from slamcli.sparse_map.sparse_map import MapBuilder
+from slamcli.sparse_map.sparse_map import SparseMap
 
 # A new landmark is on probation for so many key frames, as ORB-SLAM2 does (doi:10.1109/TRO.2017.2705103): it goes when it is found in
 # less than a quarter of the frames that should see it, or when no second key frame has seen it after two.
@@ -21,8 +21,8 @@ COVISIBLE = 15  # landmarks that two key frames share at least, to count as neig
 class MapGrowth:
     """Adds key frames to the map."""
 
-    def __init__(self, builder: MapBuilder, camera: Camera, settings: TrackConfig, sensor: SensorConfig) -> None:
-        self._builder, self._camera, self._settings, self._sensor = builder, camera, settings, sensor
+    def __init__(self, sparse_map: SparseMap, camera: Camera, settings: TrackConfig, sensor: SensorConfig) -> None:
+        self._sparse_map, self._camera, self._settings, self._sensor = sparse_map, camera, settings, sensor
         self._on_probation = np.empty(0, dtype=np.int32)  # landmarks
 
     def insert(self, i: int, frame: FrameFeatures, T_wc: np.ndarray, landmark: np.ndarray, segment: int) -> tuple[int, np.ndarray]:
@@ -31,13 +31,13 @@ class MapGrowth:
         landmark : (N,) of each feature, -1 = none
         Returns the key frame and the landmarks added; `settle` does the rest.
         """
-        builder = self._builder
-        kf = builder.add_key_frame(i, T_wc, segment)
+        sparse_map = self._sparse_map
+        kf = sparse_map.add_key_frame(i, T_wc, segment)
         known = np.flatnonzero(landmark >= 0)
-        builder.observe(kf, landmark[known], frame.first_row + known)
+        sparse_map.observe(kf, landmark[known], frame.first_row + known)
         new = np.flatnonzero((landmark < 0) & np.isfinite(frame.depth))
         x_w = se3.transform(T_wc, self._camera.backproject(frame.xy[new], frame.depth[new]))
-        return kf, builder.add_landmarks(kf, frame.first_row + new, x_w)
+        return kf, sparse_map.add_landmarks(kf, frame.first_row + new, x_w)
 
     def settle(self, kf: int, added: np.ndarray, known: np.ndarray) -> None:
         """Cull what was not found again, share the landmarks `added` with the key frames around, and adjust the window.
@@ -47,35 +47,35 @@ class MapGrowth:
         self.cull(kf)
         self._on_probation = np.concatenate([self._on_probation, added])
         self._share(kf, added)
-        self._builder.refresh(known)
+        self._sparse_map.refresh(known)
         self._adjust_window(kf)
 
     def cull(self, kf: int) -> None:
         """Remove landmarks on probation that frames up to key frame `kf` seldom found, or that no second key frame saw."""
-        lm = self._builder.lm
-        ids = self._builder.resolve(self._on_probation)
+        lm = self._sparse_map.lm
+        ids = self._sparse_map.resolve(self._on_probation)
         ids = np.unique(ids[ids >= 0])
         age = kf - lm.first_kf[ids]
         is_bad = (lm.n_found[ids] < MIN_FOUND * lm.n_visible[ids]) | ((age >= SECOND_VIEW_AFTER) & (lm.n_obs[ids] < 2))
-        self._builder.remove_landmarks(ids[is_bad])
+        self._sparse_map.remove_landmarks(ids[is_bad])
         self._on_probation = ids[~is_bad & (age < PROBATION)]
 
     def _share(self, kf: int, added: np.ndarray) -> None:
         """Look for the new landmarks in the key frames around: a free feature becomes a view, a landmark there is fused."""
-        neighbours, shared = self._builder.covisible(kf)
+        neighbours, shared = self._sparse_map.covisible(kf)
         most = self._settings.share_key_frames
         for other in neighbours[:most][shared[:most] >= COVISIBLE]:
-            ids = added[self._builder.lm.is_alive[added]]
-            fuse_landmarks(self._builder, int(other), ids, self._camera, self._sensor, max_distance=self._settings.share_max_distance)
+            ids = added[self._sparse_map.lm.is_alive[added]]
+            fuse_landmarks(self._sparse_map, int(other), ids, self._camera, self._sensor, max_distance=self._settings.share_max_distance)
 
     def _adjust_window(self, kf: int) -> None:
-        neighbours, shared = self._builder.covisible(kf)
+        neighbours, shared = self._sparse_map.covisible(kf)
         covisible = neighbours[shared >= COVISIBLE][: self._settings.window_key_frames - 1]
-        window = np.union1d(covisible, self._builder.joined_by_edges(np.array([kf])))
+        window = np.union1d(covisible, self._sparse_map.joined_by_edges(np.array([kf])))
         if len(window) == 0:
             return
         map_adjustment.adjust(
-            self._builder,
+            self._sparse_map,
             np.sort(np.append(window, kf)).astype(np.int32),
             self._camera,
             self._sensor,

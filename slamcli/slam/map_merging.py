@@ -7,7 +7,7 @@ import numpy as np
 from slamcli.geometry import se3
 from slamcli.slam import loop_closing
 from slamcli.slam.loop_closing import Candidate
-from slamcli.sparse_map.sparse_map import MapBuilder
+from slamcli.sparse_map.sparse_map import SparseMap
 
 AGREE_M, AGREE_RAD = 0.1, 0.05  # closures that differ by less agree on how two segments lie
 OUTWEIGH = 2.0  # times the landmarks of any others that agree on something else
@@ -24,25 +24,25 @@ class Join:
     support: int  # landmarks that the closures found again
 
 
-def find_join(builder: MapBuilder, closures: list[Candidate], *, least: int) -> Join | None:
+def find_join(sparse_map: SparseMap, closures: list[Candidate], *, least: int) -> Join | None:
     """Find the two segments for which the most speaks; None where fewer than `least` closures agree on how two segments lie.
 
     One closure between segments stands alone: no odometry runs between them that could contradict it. So several have to say the same,
     and no others that say otherwise may come near them in weight, as they do where places look alike.
     """
-    segment = builder.kf.segment
+    segment = sparse_map.kf.segment
     pairs = sorted({tuple(sorted((int(segment[c.kf_i]), int(segment[c.kf_j])))) for c in closures})
-    found = [_between(builder, closures, a, b) for a, b in pairs if a != b]
+    found = [_between(sparse_map, closures, a, b) for a, b in pairs if a != b]
     return max((j for j in found if j is not None and len(j.closures) >= least), key=lambda j: j.support, default=None)
 
 
-def _between(builder: MapBuilder, closures: list[Candidate], a: int, b: int) -> Join | None:
+def _between(sparse_map: SparseMap, closures: list[Candidate], a: int, b: int) -> Join | None:
     """Find what most closures between segments a and b say of how they lie; None where others contradict them."""
-    segment = builder.kf.segment
+    segment = sparse_map.kf.segment
     here = [c for c in closures if {int(segment[c.kf_i]), int(segment[c.kf_j])} == {a, b}]
     between = [c if segment[c.kf_i] == a else _turned(c) for c in here]
     T_wi, T_wj, T_ij = (
-        np.array(T) for T in zip(*((builder.kf.T_wk[c.kf_i], builder.kf.T_wk[c.kf_j], c.T_ij) for c in between), strict=True)
+        np.array(T) for T in zip(*((sparse_map.kf.T_wk[c.kf_i], sparse_map.kf.T_wk[c.kf_j], c.T_ij) for c in between), strict=True)
     )
     T_ab = T_wi @ T_ij @ se3.inverse(T_wj)
     # residual of closure n under the hypothesis of closure m, (m, n, 6)
@@ -57,15 +57,15 @@ def _between(builder: MapBuilder, closures: list[Candidate], a: int, b: int) -> 
 
 
 def _turned(c: Candidate) -> Candidate:
-    """Give a closure as seen from its other key frame."""
+    """Return a closure as seen from its other key frame."""
     assert c.T_ij is not None, "an accepted closure has a pose"
     return replace(c, kf_i=c.kf_j, kf_j=c.kf_i, T_ij=se3.inverse(c.T_ij))
 
 
-def join(builder: MapBuilder, found: Join) -> None:
+def join(sparse_map: SparseMap, found: Join) -> None:
     """Move segment b, with its landmarks, into the world of a."""
-    is_b = builder.kf.segment == found.b
-    T_wk = builder.kf.T_wk.copy()
+    is_b = sparse_map.kf.segment == found.b
+    T_wk = sparse_map.kf.T_wk.copy()
     T_wk[is_b] = found.T_ab @ T_wk[is_b]
-    loop_closing.apply(builder, T_wk)
-    builder.kf.segment[is_b] = found.a
+    loop_closing.apply(sparse_map, T_wk)
+    sparse_map.kf.segment[is_b] = found.a

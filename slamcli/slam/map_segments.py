@@ -39,5 +39,5 @@ def anchored(map_: Map, tracks: Tracks) -> Map:
 
 
 def n_segments(map_: Map) -> int:
-    """Give the number of segments."""
+    """Return the number of segments."""
     return int(map_.kf_segment.max(initial=-1)) + 1

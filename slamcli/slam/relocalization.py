@@ -9,7 +9,7 @@ from slamcli.schema import Words
 from slamcli.slam.place_recognition import PlaceIndex, bow_vector
 from slamcli.sparse_map.frame import refine_on_landmarks
 from slamcli.sparse_map.guided_matching import FrameFeatures
-from slamcli.sparse_map.sparse_map import MapBuilder
+from slamcli.sparse_map.sparse_map import SparseMap
 from slamcli.vision import hamming
 
 MORE_ROUNDS = 3  # times the rounds of RANSAC between neighbouring frames: fewer of the matches are true
@@ -19,20 +19,20 @@ class Relocalizer:
     """Finds frames in the map by their bags of words."""
 
     def __init__(
-        self, builder: MapBuilder, places: PlaceIndex, words: Words, camera: Camera, settings: TrackConfig, rng: np.random.Generator
+        self, sparse_map: SparseMap, places: PlaceIndex, words: Words, camera: Camera, settings: TrackConfig, rng: np.random.Generator
     ) -> None:
         """Take the map with the index of its key frames, and the words of the recording whose frames are looked for."""
-        self._builder, self._places, self._words = builder, places, words
+        self._sparse_map, self._places, self._words = sparse_map, places, words
         self._camera, self._settings, self._rng = camera, settings, rng
 
     def find(self, i: int, frame: FrameFeatures) -> tuple[np.ndarray, np.ndarray] | None:
         """Find T_cw (4, 4) of frame `i` and the landmarks (N,) that it shows in the likest key frame that agrees; None in none."""
         kfs, scores = self._places.query(bow_vector(self._words, i))
-        for kf in kfs[np.argsort(-scores, kind="stable")[: self._settings.relocalise_candidates]]:
+        for kf in kfs[np.argsort(-scores, kind="stable")[: self._settings.relocalize_candidates]]:
             row, ids = self._match_key_frame(int(kf), frame)
             if len(row) < self._settings.min_inliers:
                 continue
-            x_w = self._builder.lm.xyz[ids]
+            x_w = self._sparse_map.lm.xyz[ids]
             start = camera_pose.ransac_p3p(
                 x_w,
                 frame.xy[row],
@@ -50,15 +50,15 @@ class Relocalizer:
 
     def _match_key_frame(self, kf: int, frame: FrameFeatures) -> tuple[np.ndarray, np.ndarray]:
         """Match the frame with the landmarks of a key frame under the same vocabulary nodes; returns its features and the landmarks."""
-        there = self._builder.rows_of(kf)
+        there = self._sparse_map.rows_of(kf)
         here = slice(frame.first_row, frame.first_row + len(frame))
         match, _ = hamming.match_nodes(
             frame.desc.view(np.uint8),
             self._words.node[here],
-            self._builder.features.desc[there],
+            self._sparse_map.features.desc[there],
             self._places.words.node[there],
             frame.angle,
-            self._builder.features.angle[there],
+            self._sparse_map.features.angle[there],
         )
-        ids = self._builder.lm_of_row[there][match[:, 1]]
+        ids = self._sparse_map.lm_of_row[there][match[:, 1]]
         return match[ids >= 0, 0], ids[ids >= 0]

@@ -5,14 +5,14 @@ import numpy as np
 from slamcli.config.options import SensorConfig, TrackConfig
 from slamcli.geometry import se3
 from slamcli.geometry.camera import Camera
-from slamcli.schema import KEY_FRAME, ON_SHAPE, TRACKED, Features, Map, Matches, Tracks, Words
+from slamcli.schema import KEY_FRAME, ON_DEPTH, TRACKED, Features, Map, Matches, Tracks, Words
 from slamcli.slam import key_frames
-from slamcli.slam.depth_tracking import NO_RELIEFS, Placement, Reliefs
+from slamcli.slam.depth_tracking import NO_FRAME_POINTS, FramePoints, Placement
 from slamcli.slam.localizer import Localizer, Location, nothing_seen
 from slamcli.slam.map_growth import MapGrowth
 from slamcli.slam.place_recognition import PlaceIndex
 from slamcli.sparse_map.guided_matching import FrameFeatures
-from slamcli.sparse_map.sparse_map import MapBuilder
+from slamcli.sparse_map.sparse_map import SparseMap
 
 # [1/m^2, 1/rad^2] of the background's motion between key frames: within 10 mm and 0.6 degrees.
 BACKGROUND_INFORMATION = 1e4 * np.eye(6)
@@ -35,19 +35,19 @@ class Tracker:
         sensor: SensorConfig,
         rng: np.random.Generator,
         *,
-        reliefs: Reliefs = NO_RELIEFS,
+        frame_points: FramePoints = NO_FRAME_POINTS,
         background: np.ndarray | None = None,
     ) -> None:
-        """Take a recording's features, words and matches; without `reliefs`, texture alone is followed.
+        """Take a recording's features, words and matches; without `frame_points`, texture alone is followed.
 
         background : (F, 4, 4) the camera's motion against what stands still, where it was found beforehand: it predicts, and joins key
             frames
         """
         self._settings, self._background = settings, background
-        self._builder = MapBuilder(features)
-        self._places = PlaceIndex(words, self._builder.kf.frame)
+        self._sparse_map = SparseMap(features)
+        self._places = PlaceIndex(words, self._sparse_map.kf.frame)
         self._localizer = Localizer(
-            self._builder,
+            self._sparse_map,
             self._places,
             features,
             words,
@@ -56,13 +56,13 @@ class Tracker:
             settings,
             sensor,
             rng,
-            reliefs=reliefs,
-            map_reliefs=reliefs,
+            frame_points=frame_points,
+            map_frame_points=frame_points,
             background=background,
             make_reference=self._make_reference,
         )
         self._poses, self._previous = self._localizer.poses, self._localizer.previous
-        self._growth = MapGrowth(self._builder, camera, settings, sensor)
+        self._growth = MapGrowth(self._sparse_map, camera, settings, sensor)
         self._segment = -1  # that frames are added to; -1 before the first
         self._n_lost = 0  # frames in a row that saw enough and were not recognized
         self._first_lost = -1  # of these
@@ -84,7 +84,7 @@ class Tracker:
 
     def map(self) -> Map:
         """Return the map built so far."""
-        return self._builder.snapshot()
+        return self._sparse_map.snapshot()
 
     def tracks(self) -> Tracks:
         """Return the pose of every frame processed."""
@@ -108,9 +108,9 @@ class Tracker:
     def _view(self, i: int, frame: FrameFeatures, landmark: np.ndarray) -> key_frames.View:
         """Count what frame `i` sees, for the key-frame rule."""
         T_wc = self._poses.T_wc(i)
-        kf, lm = self._builder.kf, self._builder.lm
+        kf, lm = self._sparse_map.kf, self._sparse_map.lm
         is_near, is_known, is_here = np.isfinite(frame.depth), landmark >= 0, kf.segment == self._segment
-        seen = self._builder.landmarks_of(int(self._poses.ref_kf[i]))
+        seen = self._sparse_map.landmarks_of(int(self._poses.ref_kf[i]))
         least = min(2, np.count_nonzero(is_here))
         return key_frames.View(
             n_landmarks=int(np.count_nonzero(is_known)),
@@ -127,27 +127,27 @@ class Tracker:
         self._places.add(i)
         known = landmark[landmark >= 0]
         # Landmarks enough to recognize a place by hold the key frame; depth alone might slide along a corridor.
-        if self._poses.state[i] == ON_SHAPE and len(known) < self._settings.relocalise_inliers:
+        if self._poses.state[i] == ON_DEPTH and len(known) < self._settings.relocalize_inliers:
             self._localizer.shape.join(kf)
         if self._background is not None:
             self._join_by_background(kf, self._background)
         self._poses.make_key_frame(i, kf)
         self._growth.settle(kf, added, known)
-        return self._builder.resolve(self._builder.lm_of_row[self._builder.rows_of(kf)])
+        return self._sparse_map.resolve(self._sparse_map.lm_of_row[self._sparse_map.rows_of(kf)])
 
     def _join_by_background(self, kf: int, T_wb: np.ndarray) -> None:
         """Add an edge from a key frame to the one before it in its segment, as far apart as the background's motion says."""
-        frame, segment = self._builder.kf.frame, self._builder.kf.segment
+        frame, segment = self._sparse_map.kf.frame, self._sparse_map.kf.segment
         before = np.flatnonzero(segment[:kf] == segment[kf])
         if len(before):
             other = int(before[-1])
             T_ij = se3.inverse(T_wb[frame[kf]]) @ T_wb[frame[other]]
-            self._builder.add_edge(kf, other, T_ij, BACKGROUND_INFORMATION)
+            self._sparse_map.add_edge(kf, other, T_ij, BACKGROUND_INFORMATION)
 
     def _make_reference(self, i: int) -> int | None:
         """Make the frame before `i` a key frame that depth can be aligned with; None where its own pose is not fully measured."""
         previous = self._previous.features
-        if previous is None or self._poses.anchored != i - 1 or self._poses.state[i - 1] not in (TRACKED, ON_SHAPE):
+        if previous is None or self._poses.anchored != i - 1 or self._poses.state[i - 1] not in (TRACKED, ON_DEPTH):
             return None
         self._previous.remember(previous, self._add_key_frame(i - 1, previous, self._poses.T_wc(i - 1), self._previous.landmark))
         return int(self._poses.ref_kf[i - 1])
@@ -162,7 +162,7 @@ class Tracker:
                 seen = f"{len(frame)} features, {n_depth} with depth, {self._settings.start_features} wanted"
                 self.lost_reason[i] = f"no map yet: {seen}, and depth shows too little shape to begin with"
             return nothing_seen(frame)
-        self._segment, self._n_lost = len(np.unique(self._builder.kf.segment)), 0
+        self._segment, self._n_lost = len(np.unique(self._sparse_map.kf.segment)), 0
         self.lost_reason.pop(i, None)
         return self._add_key_frame(i, frame, np.eye(4), nothing_seen(frame))
 

@@ -7,41 +7,41 @@ from slamcli.geometry import se3
 from slamcli.geometry.camera import Camera
 from slamcli.sparse_map import guided_matching
 from slamcli.sparse_map.frame import frame_features
-from slamcli.sparse_map.sparse_map import MapBuilder
+from slamcli.sparse_map.sparse_map import SparseMap
 
 WITHIN_SIGMA = 3.0  # of the projection, and of the depth reading, that a feature must lie
 # [of the depth] beside the noise of the reading: the landmark's own depth was read once, maybe from another distance.
 DEPTH_MARGIN = 0.02
 
 
-def fuse_landmarks(builder: MapBuilder, kf: int, ids: np.ndarray, camera: Camera, sensor: SensorConfig, *, max_distance: int) -> int:
+def fuse_landmarks(sparse_map: SparseMap, kf: int, ids: np.ndarray, camera: Camera, sensor: SensorConfig, *, max_distance: int) -> int:
     """Look for landmarks in a key frame: a free feature becomes a view, a landmark that is there already is fused.
 
     ids : (N,) landmarks; max_distance : of descriptors [bits]
     Returns how many were found. A feature must lie within 3 sigma of the projection, in depth too.
     """
-    ids = np.setdiff1d(ids, builder.landmarks_of(kf))
+    ids = np.setdiff1d(ids, sparse_map.landmarks_of(kf))
     if len(ids) == 0:
         return 0
-    frame = frame_features(builder.features, int(builder.kf.frame[kf]), camera, sensor)
-    T_kw = se3.inverse(builder.kf.T_wk[kf])
+    frame = frame_features(sparse_map.features, int(sparse_map.kf.frame[kf]), camera, sensor)
+    T_kw = se3.inverse(sparse_map.kf.T_wk[kf])
     feature, _ = guided_matching.search(
         T_kw,
-        builder.candidates(ids),
+        sparse_map.candidates(ids),
         frame,
         camera,
-        octave_scale=builder.octave_scale,
+        octave_scale=sparse_map.octave_scale,
         radius_px=WITHIN_SIGMA * sensor.pixel_noise,
         max_distance=max_distance,
         ratio=1.0,
     )
     which = np.flatnonzero(feature >= 0)
-    z = se3.transform(T_kw, builder.lm.xyz[ids[which]])[:, 2]
+    z = se3.transform(T_kw, sparse_map.lm.xyz[ids[which]])[:, 2]
     f = feature[which]
     agrees = ~(np.abs(z - frame.depth[f]) > WITHIN_SIGMA * frame.sigma_z[f] + DEPTH_MARGIN * z)
     which, f = which[agrees], f[agrees]
-    there = builder.lm_of_row[frame.first_row + f]
+    there = sparse_map.lm_of_row[frame.first_row + f]
     is_free = there < 0
-    builder.observe(kf, ids[which[is_free]], frame.first_row + f[is_free])
-    builder.fuse(there[~is_free], ids[which[~is_free]])
+    sparse_map.observe(kf, ids[which[is_free]], frame.first_row + f[is_free])
+    sparse_map.fuse(there[~is_free], ids[which[~is_free]])
     return len(which)

@@ -13,7 +13,7 @@ from slamcli.estimation.relative_pose_factors import Edges
 from slamcli.geometry import se3
 from slamcli.geometry.camera import Camera
 from slamcli.schema import Features
-from slamcli.sparse_map.sparse_map import MapBuilder
+from slamcli.sparse_map.sparse_map import SparseMap
 
 
 @dataclass(frozen=True)
@@ -59,59 +59,61 @@ class Part:
     edges: Edges  # between key frames of kfs
 
 
-def gather(builder: MapBuilder, moving: np.ndarray, sensor: SensorConfig) -> Part:
+def gather(sparse_map: SparseMap, moving: np.ndarray, sensor: SensorConfig) -> Part:
     """Gather the key frames `moving` and all they see; key frames outside that see the same, or that edges join to them, are held fixed.
 
     In a segment where none is held so, the oldest of `moving` is, which fixes the gauge.
     """
-    ids = builder.landmarks_in(moving)
-    is_single = builder.lm.n_obs[ids] < 2
+    ids = sparse_map.landmarks_in(moving)
+    is_single = sparse_map.lm.n_obs[ids] < 2
     shared = ids[~is_single]
-    obs_lm, obs_kf, row = builder.observations_of(shared)
-    kfs = np.union1d(np.union1d(moving, obs_kf), builder.joined_by_edges(moving))
+    obs_lm, obs_kf, row = sparse_map.observations_of(shared)
+    kfs = np.union1d(np.union1d(moving, obs_kf), sparse_map.joined_by_edges(moving))
     is_fixed = ~np.isin(kfs, moving)
-    segments, oldest = np.unique(builder.kf.segment[kfs], return_index=True)
-    is_fixed[oldest[~np.isin(segments, builder.kf.segment[kfs[is_fixed]])]] = True
+    segments, oldest = np.unique(sparse_map.kf.segment[kfs], return_index=True)
+    is_fixed[oldest[~np.isin(segments, sparse_map.kf.segment[kfs[is_fixed]])]] = True
     kf_index = np.searchsorted(kfs, obs_kf).astype(np.int32)
-    is_inside = np.isin(builder.edge.kf, kfs).all(axis=1) & np.isin(builder.edge.kf, moving).any(axis=1)
-    edges = Edges(np.searchsorted(kfs, builder.edge.kf[is_inside]), builder.edge.T_ij[is_inside], builder.edge.information[is_inside])
-    measured = measure(builder.features, row, sensor)
+    is_inside = np.isin(sparse_map.edge.kf, kfs).all(axis=1) & np.isin(sparse_map.edge.kf, moving).any(axis=1)
+    edges = Edges(
+        np.searchsorted(kfs, sparse_map.edge.kf[is_inside]), sparse_map.edge.T_ij[is_inside], sparse_map.edge.information[is_inside]
+    )
+    measured = measure(sparse_map.features, row, sensor)
     seen = Observations(kf_index, obs_lm, measured.xy, measured.depth, measured.sigma_px, measured.sigma_z)
     return Part(kfs, is_fixed, shared, ids[is_single], row, seen, edges)
 
 
 def adjust(
-    builder: MapBuilder, moving: np.ndarray, camera: Camera, sensor: SensorConfig, *, max_iterations: int, edge_weight: float = 1.0
+    sparse_map: SparseMap, moving: np.ndarray, camera: Camera, sensor: SensorConfig, *, max_iterations: int, edge_weight: float = 1.0
 ) -> bundle_adjustment.BundleResult | None:
     """Adjust the key frames `moving` and all they see, in place, and remove the observations found to be outliers.
 
     edge_weight : factor on the information of edges between key frames
     Returns the evidence, or None where nothing ties two key frames together.
     """
-    part = gather(builder, moving, sensor)
+    part = gather(sparse_map, moving, sensor)
     if len(part.row) == 0 and len(part.edges) == 0:
         return None
     result = bundle_adjustment.adjust(
-        builder.T_kw(part.kfs),
-        builder.lm.xyz[part.ids],
+        sparse_map.T_kw(part.kfs),
+        sparse_map.lm.xyz[part.ids],
         part.seen,
         camera,
         is_fixed=part.is_fixed,
         edges=replace(part.edges, information=edge_weight * part.edges.information),
         max_iterations=max_iterations,
     )
-    before = builder.kf.T_wk[part.kfs].copy()
-    builder.kf.T_wk[part.kfs[~part.is_fixed]] = se3.inverse(result.T_cw[~part.is_fixed])
-    builder.lm.xyz[part.ids] = result.x_w
-    carry(builder, part.singles, part.kfs, before)
-    builder.remove_observations(part.row[~result.is_inlier])
+    before = sparse_map.kf.T_wk[part.kfs].copy()
+    sparse_map.kf.T_wk[part.kfs[~part.is_fixed]] = se3.inverse(result.T_cw[~part.is_fixed])
+    sparse_map.lm.xyz[part.ids] = result.x_w
+    carry(sparse_map, part.singles, part.kfs, before)
+    sparse_map.remove_observations(part.row[~result.is_inlier])
     return result
 
 
-def carry(builder: MapBuilder, ids: np.ndarray, kfs: np.ndarray, T_wk_before: np.ndarray) -> None:
+def carry(sparse_map: SparseMap, ids: np.ndarray, kfs: np.ndarray, T_wk_before: np.ndarray) -> None:
     """Move landmarks `ids` rigidly with the key frame that created them, from the poses `T_wk_before` of `kfs` (sorted) to those of now."""
-    of = np.searchsorted(kfs, builder.lm.first_kf[ids])
-    is_known = (of < len(kfs)) & (kfs[np.minimum(of, len(kfs) - 1)] == builder.lm.first_kf[ids])
+    of = np.searchsorted(kfs, sparse_map.lm.first_kf[ids])
+    is_known = (of < len(kfs)) & (kfs[np.minimum(of, len(kfs) - 1)] == sparse_map.lm.first_kf[ids])
     ids, of = ids[is_known], of[is_known]
-    motion = builder.kf.T_wk[kfs] @ se3.inverse(T_wk_before)
-    builder.lm.xyz[ids] = np.einsum("nij,nj->ni", motion[of, :3, :3], builder.lm.xyz[ids]) + motion[of, :3, 3]
+    motion = sparse_map.kf.T_wk[kfs] @ se3.inverse(T_wk_before)
+    sparse_map.lm.xyz[ids] = np.einsum("nij,nj->ni", motion[of, :3, :3], sparse_map.lm.xyz[ids]) + motion[of, :3, 3]

@@ -11,7 +11,7 @@ from slamcli.sparse_map.guided_matching import Candidates
 from slamcli.sparse_map.table import Table
 
 
-class MapBuilder:
+class SparseMap:
     """Key frames and landmarks with their observations, as flat tables.
 
     A landmark's observations form a chain through `obs.next`, starting at `lm.head`; -1 ends it. An observation that was removed keeps
@@ -45,7 +45,7 @@ class MapBuilder:
     def add_key_frame(self, frame: int, T_wk: np.ndarray, segment: int = 0) -> int:
         """Add a key frame without observations; returns its row."""
         # Its pose often comes from that of the key frame before, by products and inverses that double the rounding each time.
-        return self.kf.append(1, frame=frame, segment=segment, T_wk=se3.orthonormalise(T_wk)).start
+        return self.kf.append(1, frame=frame, segment=segment, T_wk=se3.orthonormalize(T_wk)).start
 
     def add_landmarks(self, kf: int, rows: np.ndarray, xyz: np.ndarray) -> np.ndarray:
         """Create landmarks at `xyz` (N, 3) [m, world], each seen by key frame `kf` as feature `rows` (N,); returns their ids."""
@@ -81,12 +81,12 @@ class MapBuilder:
         self.edge.append(1, kf=(kf_i, kf_j), T_ij=T_ij, information=information)
 
     def joined_by_edges(self, kfs: np.ndarray) -> np.ndarray:
-        """Give the key frames (N,) that edges join to any of `kfs`, these themselves left out, increasing."""
+        """Return the key frames (N,) that edges join to any of `kfs`, these themselves left out, increasing."""
         touches = np.isin(self.edge.kf, kfs)
         return np.setdiff1d(self.edge.kf[touches.any(axis=1)], kfs).astype(np.int32)
 
     def rows_of(self, kf: int) -> slice:
-        """Give the feature rows of a key frame."""
+        """Return the feature rows of a key frame."""
         offset = self.features.offset
         frame = self.kf.frame[kf]
         return slice(int(offset[frame]), int(offset[frame + 1]))
@@ -109,29 +109,29 @@ class MapBuilder:
         return counts
 
     def landmarks_in(self, kfs: np.ndarray) -> np.ndarray:
-        """Give the landmarks (N,) that any of the key frames sees, increasing."""
+        """Return the landmarks (N,) that any of the key frames sees, increasing."""
         is_seen, frame = np.zeros(len(self.lm), dtype=np.bool_), self.kf.frame[kfs]
         _mark(self._offset[frame], self._offset[frame + 1], self.lm_of_row, is_seen)
         return np.flatnonzero(is_seen).astype(np.int32)
 
     def landmarks_of(self, kf: int) -> np.ndarray:
-        """Give the landmarks (N,) of one key frame in the order of its features."""
+        """Return the landmarks (N,) of one key frame in the order of its features."""
         ids = self.lm_of_row[self.rows_of(kf)]
         return ids[ids >= 0]
 
     def covisible(self, kf: int) -> tuple[np.ndarray, np.ndarray]:
-        """Give the key frames that share landmarks with `kf`, most first, and how many they share."""
+        """Return the key frames that share landmarks with `kf`, most first, and how many they share."""
         counts = self.votes(self.landmarks_of(kf))
         counts[kf] = 0
         order = np.argsort(-counts, kind="stable")[: np.count_nonzero(counts)]
         return order.astype(np.int32), counts[order]
 
     def candidates(self, ids: np.ndarray) -> Candidates:
-        """Give landmarks in the form that guided matching takes."""
+        """Return landmarks in the form that guided matching takes."""
         return Candidates(*(column.take(ids, axis=0) for column in (self.lm.xyz, self.lm.desc, self.lm.direction, self.lm.reach)))
 
     def observations_of(self, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Give all observations of landmarks `ids`: index into `ids`, key frame, feature row; sorted by (landmark, key frame)."""
+        """Return all observations of landmarks `ids`: index into `ids`, key frame, feature row; sorted by (landmark, key frame)."""
         total = int(self.lm.n_obs[ids].sum())
         which, kf, row = np.empty(total, np.int32), np.empty(total, np.int32), np.empty(total, np.int64)
         n = _gather(ids, self.lm.head, self.obs.next, self.obs.kf, self.obs.row, which, kf, row)
@@ -176,7 +176,7 @@ class MapBuilder:
         )
 
     def snapshot(self) -> Map:
-        """Give the map as an artefact: living landmarks, renumbered."""
+        """Return the map as an artefact: living landmarks, renumbered."""
         ids = np.flatnonzero(self.lm.is_alive & (self.lm.n_obs > 0)).astype(np.int32)
         which, kf, row = self.observations_of(ids)
         return Map(
@@ -193,7 +193,7 @@ class MapBuilder:
         )
 
     @classmethod
-    def from_map(cls, features: Features, map_: Map) -> "MapBuilder":
+    def from_map(cls, features: Features, map_: Map) -> "SparseMap":
         """Rebuild the growing form of a map."""
         self = cls(features)
         n_kf, n_lm = len(map_.kf_frame), len(map_.lm_xyz)
@@ -222,11 +222,11 @@ class MapBuilder:
         return self
 
     def centres(self) -> np.ndarray:
-        """Give the camera centres (K, 3) of the key frames [m, world]."""
+        """Return the camera centres (K, 3) of the key frames [m, world]."""
         return self.kf.T_wk[:, :3, 3]
 
     def T_kw(self, kfs: np.ndarray) -> np.ndarray:
-        """Give world-to-camera transforms (N, 4, 4) of key frames."""
+        """Return world-to-camera transforms (N, 4, 4) of key frames."""
         return se3.inverse(self.kf.T_wk[kfs])
 
 

@@ -27,7 +27,7 @@ STAGES = (
         "loop",
         ("extract", "match", "track", "optimize"),
         ("sensor", "track", "loop"),
-        "Recognise revisited places, close the loops and refine every frame.",
+        "Recognize revisited places, close the loops and refine every frame.",
     ),
     Stage(
         "densify",

@@ -16,12 +16,12 @@ from slamcli.formats.g2o import write_g2o
 from slamcli.geometry.camera import Camera
 from slamcli.schema import LOST, Closures, Map, Moving, Timing, Tracks, Words, frame_segments
 from slamcli.slam import doubt, final_refinement, loop_closing, map_merging, map_segments, pose_doubt
-from slamcli.slam.depth_tracking import Reliefs
+from slamcli.slam.depth_tracking import FramePoints
 from slamcli.slam.loop_closing import Candidate, Claims
 from slamcli.slam.moving_objects import FOR_MAPS
 from slamcli.slam.place_recognition import PlaceIndex
 from slamcli.sparse_map import map_adjustment
-from slamcli.sparse_map.sparse_map import MapBuilder
+from slamcli.sparse_map.sparse_map import SparseMap
 from slamcli.stages import moving_parts
 from slamcli.stages.camera_file import write_camera
 from slamcli.stages.contract import Inputs, Summary, Tools
@@ -36,27 +36,27 @@ def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
     moving = inputs.load(Moving, "track")
     features, depth = moving_parts.still(inputs, moving)
     features = self_calibration.correct(features, given, sensing)
-    builder = MapBuilder.from_map(features, inputs.load(Map, "optimize"))
+    sparse_map = SparseMap.from_map(features, inputs.load(Map, "optimize"))
     tried: list[Candidate] = []
-    if cfg.loop.enabled and len(builder.kf) > 2:
-        tried = close_loops(builder, words, camera, cfg, tools)
+    if cfg.loop.enabled and len(sparse_map.kf) > 2:
+        tried = close_loops(sparse_map, words, camera, cfg, tools)
     accepted = [c for c in tried if c.is_accepted]
-    if accepted and cfg.loop.hindsight:
-        tracks, _ = final_refinement.look_again(
-            builder,
+    if accepted and cfg.loop.final_refinement:
+        tracks, _ = final_refinement.refine_all(
+            sparse_map,
             tracks,
             sensing,
             cfg.sensor,
             cfg.track,
-            reliefs=Reliefs(depth, given, cfg.sensor),
-            shape_edges=cfg.loop.shape_edges,
-            shape_weight=cfg.loop.shape_weight,
+            frame_points=FramePoints(depth, given, cfg.sensor),
+            depth_icp_edges=cfg.loop.depth_icp_edges,
+            depth_icp_weight=cfg.loop.depth_icp_weight,
             iterations=cfg.loop.iterations,
             progress=tools.progress,
             workers=tools.workers,
         )
-    map_ = map_segments.anchored(main_first(builder.snapshot(), tracks, cfg.loop.main_segment), tracks)
-    write_pose_graph(out / "posegraph.g2o", map_.T_wk, loop_closing.build_pose_graph(builder, accepted, cfg.loop))
+    map_ = map_segments.anchored(main_first(sparse_map.snapshot(), tracks, cfg.loop.main_segment), tracks)
+    write_pose_graph(out / "posegraph.g2o", map_.T_wk, loop_closing.build_pose_graph(sparse_map, accepted, cfg.loop))
     write_candidates(out / "candidates.csv", tried)
     for segment, told in enumerate(describe_other_segments(tracks, map_), start=1):
         tools.warn(f"{told}, could not be joined: their poses, in a frame of their own, are in {segment_file(segment)}; no map shows them")
@@ -94,77 +94,77 @@ def main_first(map_: Map, tracks: Tracks, main: int) -> Map:
     return map_segments.ranked(map_, tracks, main)
 
 
-def close_loops(builder: MapBuilder, words: Words, camera: Camera, cfg: Config, tools: Tools) -> list[Candidate]:
+def close_loops(sparse_map: SparseMap, words: Words, camera: Camera, cfg: Config, tools: Tools) -> list[Candidate]:
     """Search, verify, correct, fuse, adjust; again while that brings new closures. Returns all candidates with their fate."""
-    places = PlaceIndex(words, builder.kf.frame)
+    places = PlaceIndex(words, sparse_map.kf.frame)
     rng = tools.rng()
-    fate = join_segments(builder, places, camera, cfg, rng)
+    fate = join_segments(sparse_map, places, camera, cfg, rng)
     for _ in range(cfg.loop.rounds):
         new = []
         # One closure joins its whole neighbourhood: fusion finds the rest. And where the graph contradicted one, words would only
         # name its like again; what the poses of now name is another idea.
         closed = Claims((c for c in fate.values() if c.is_accepted), span=cfg.loop.closure_spacing)
         contradicted = Claims((c for c in fate.values() if not c.is_accepted and c.T_ij is not None), span=cfg.loop.closure_spacing)
-        candidates = loop_closing.find_candidates(builder, places, cfg.loop) + loop_closing.find_near(builder, places, cfg.loop)
+        candidates = loop_closing.find_candidates(sparse_map, places, cfg.loop) + loop_closing.find_near(sparse_map, places, cfg.loop)
         for candidate in tools.progress(candidates, "loop"):
             pair = (candidate.kf_i, candidate.kf_j)
-            if are_apart(builder, candidate):
+            if are_apart(sparse_map, candidate):
                 continue
             if closed.cover(candidate) or (not candidate.is_near and contradicted.cover(candidate)):
                 continue
-            fate[pair] = loop_closing.verify(builder, words, candidate, camera, cfg.loop, cfg.sensor, rng)
+            fate[pair] = loop_closing.verify(sparse_map, words, candidate, camera, cfg.loop, cfg.sensor, rng)
             if fate[pair].is_accepted:
                 new.append(fate[pair])
                 closed.add(fate[pair])
         if not new:
             break
-        graph = loop_closing.close(builder, new, cfg.loop)
+        graph = loop_closing.close(sparse_map, new, cfg.loop)
         is_kept, chi2 = graph.is_kept[-len(new) :], graph.chi2[-len(new) :]
         for c, value in zip(itertools.compress(new, ~is_kept), chi2[~is_kept], strict=True):
             fate[c.kf_i, c.kf_j] = loop_closing.reject(c, f"the pose graph contradicts it (chi2 {value:.0f})")
         if not is_kept.any():
             break
-        loop_closing.apply(builder, graph.T_wk)
-        settle(builder, list(itertools.compress(new, is_kept)), camera, cfg)
+        loop_closing.apply(sparse_map, graph.T_wk)
+        settle(sparse_map, list(itertools.compress(new, is_kept)), camera, cfg)
     return [fate[key] for key in sorted(fate)]
 
 
-def settle(builder: MapBuilder, closures: list[Candidate], camera: Camera, cfg: Config) -> None:
+def settle(sparse_map: SparseMap, closures: list[Candidate], camera: Camera, cfg: Config) -> None:
     """Fuse what both sides of the closures see, and adjust the whole map."""
     for c in closures:
-        loop_closing.fuse_around(builder, c, camera, cfg.loop, cfg.sensor)
-    builder.refresh(np.flatnonzero(builder.lm.is_alive).astype(np.int32))
-    kfs = np.arange(len(builder.kf), dtype=np.int32)
-    map_adjustment.adjust(builder, kfs, camera, cfg.sensor, max_iterations=cfg.loop.iterations)
+        loop_closing.fuse_around(sparse_map, c, camera, cfg.loop, cfg.sensor)
+    sparse_map.refresh(np.flatnonzero(sparse_map.lm.is_alive).astype(np.int32))
+    kfs = np.arange(len(sparse_map.kf), dtype=np.int32)
+    map_adjustment.adjust(sparse_map, kfs, camera, cfg.sensor, max_iterations=cfg.loop.iterations)
 
 
-def are_apart(builder: MapBuilder, c: Candidate) -> bool:
+def are_apart(sparse_map: SparseMap, c: Candidate) -> bool:
     """Say whether the two key frames belong to different map segments."""
-    return bool(builder.kf.segment[c.kf_i] != builder.kf.segment[c.kf_j])
+    return bool(sparse_map.kf.segment[c.kf_i] != sparse_map.kf.segment[c.kf_j])
 
 
 def join_segments(
-    builder: MapBuilder, places: PlaceIndex, camera: Camera, cfg: Config, rng: np.random.Generator
+    sparse_map: SparseMap, places: PlaceIndex, camera: Camera, cfg: Config, rng: np.random.Generator
 ) -> dict[tuple[int, int], Candidate]:
     """Join map segments that saw the same place. Returns the fate of candidates between segments, by pair of key frames."""
-    if len(np.unique(builder.kf.segment)) < 2:
+    if len(np.unique(sparse_map.kf.segment)) < 2:
         return {}
-    between = [c for c in loop_closing.find_candidates(builder, places, cfg.loop) if are_apart(builder, c)]
-    tried = [loop_closing.verify(builder, places.words, c, camera, cfg.loop, cfg.sensor, rng) for c in between]
+    between = [c for c in loop_closing.find_candidates(sparse_map, places, cfg.loop) if are_apart(sparse_map, c)]
+    tried = [loop_closing.verify(sparse_map, places.words, c, camera, cfg.loop, cfg.sensor, rng) for c in between]
     fate = [c for c in tried if not c.is_accepted]
     left = [c for c in tried if c.is_accepted]
-    while found := map_merging.find_join(builder, left, least=cfg.loop.join_closures):
-        map_merging.join(builder, found)
-        settle(builder, loop_closing.spread(found.closures, span=cfg.loop.closure_spacing), camera, cfg)
+    while found := map_merging.find_join(sparse_map, left, least=cfg.loop.join_closures):
+        map_merging.join(sparse_map, found)
+        settle(sparse_map, loop_closing.spread(found.closures, span=cfg.loop.closure_spacing), camera, cfg)
         fate += found.closures
         # What says otherwise is tried again like any loop, now that odometry of a kind runs between the segments.
-        left = [c for c in left if are_apart(builder, c)]
+        left = [c for c in left if are_apart(sparse_map, c)]
     alone = f"closures between the two map segments are fewer than {cfg.loop.join_closures}, or others contradict it"
     return {(c.kf_i, c.kf_j): c for c in (*fate, *(loop_closing.reject(c, alone) for c in left))}
 
 
 def closures_of(accepted: list[Candidate]) -> Closures:
-    """Give accepted closures as an artefact."""
+    """Return accepted closures as an artefact."""
     return Closures(
         closure_kf=np.array([(c.kf_i, c.kf_j) for c in accepted], dtype=np.int32).reshape(-1, 2),
         closure_T_ij=np.array([c.T_ij for c in accepted], dtype=np.float64).reshape(-1, 4, 4),

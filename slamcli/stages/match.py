@@ -15,7 +15,7 @@ from slamcli.vision import hamming, optical_flow, vocabulary
 
 
 def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
-    """Quantise every feature, make the frames' word vectors, match each frame to those before it."""
+    """Quantize every feature, make the frames' word vectors, match each frame to those before it."""
     features, settings = inputs.load(Features, "extract"), cfg.match
     words = _words(features, vocabulary.load(settings.vocabulary), settings)
     pairs = [(i, j) for i in range(len(features.stamp)) for j in range(max(0, i - settings.window), i)]
@@ -40,7 +40,7 @@ def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
 
 
 def _words(features: Features, words: vocabulary.Vocabulary, settings: MatchConfig) -> Words:
-    word, node = vocabulary.quantise(words, features.desc, node_level=settings.node_level, margin=settings.node_margin)
+    word, node = vocabulary.quantize(words, features.desc, node_level=settings.node_level, margin=settings.node_margin)
     bow_offset, bow_word, bow_weight = vocabulary.word_vectors(word, features.offset, words.idf)
     return Words(idf=words.idf, word=word, node=node, bow_offset=bow_offset, bow_word=bow_word, bow_weight=bow_weight)
 

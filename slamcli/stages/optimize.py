@@ -12,9 +12,9 @@ from slamcli.calibration.self_calibration import Sensing
 from slamcli.config.options import Config
 from slamcli.schema import Features, Map, Moving, Timing, Tracks
 from slamcli.slam import final_refinement, map_segments
-from slamcli.slam.depth_tracking import NO_RELIEFS, Reliefs
+from slamcli.slam.depth_tracking import NO_FRAME_POINTS, FramePoints
 from slamcli.sparse_map import map_adjustment
-from slamcli.sparse_map.sparse_map import MapBuilder
+from slamcli.sparse_map.sparse_map import SparseMap
 from slamcli.stages import moving_parts
 from slamcli.stages.camera_file import write_camera
 from slamcli.stages.contract import Inputs, Summary, Tools
@@ -30,10 +30,10 @@ def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
     still = Timing(np.array(0.0), np.array(0.0), depth_delay=delay, twist=rolling_shutter.frame_twists(features.stamp, tracks, map_))
     sensing, summary = Sensing(given, still, {}), dict[str, Any]()
     if cfg.optimize.enabled and len(map_.kf_frame) > 1:
-        builder = MapBuilder.from_map(features, map_)
-        reliefs = Reliefs(depth, given, cfg.sensor)
-        tracks, sensing, summary = refine(builder, features, tracks, sensing, cfg, tools, reliefs=reliefs)
-        map_ = map_segments.anchored(builder.snapshot(), tracks)
+        sparse_map = SparseMap.from_map(features, map_)
+        frame_points = FramePoints(depth, given, cfg.sensor)
+        tracks, sensing, summary = refine(sparse_map, features, tracks, sensing, cfg, tools, frame_points=frame_points)
+        map_ = map_segments.anchored(sparse_map.snapshot(), tracks)
     save_map(out, features.stamp, tracks, map_)
     artifacts.save(sensing.timing, out)
     write_camera(out, sensing.camera)
@@ -41,33 +41,40 @@ def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
 
 
 def refine(
-    builder: MapBuilder, features: Features, tracks: Tracks, sensing: Sensing, cfg: Config, tools: Tools, *, reliefs: Reliefs = NO_RELIEFS
+    sparse_map: SparseMap,
+    features: Features,
+    tracks: Tracks,
+    sensing: Sensing,
+    cfg: Config,
+    tools: Tools,
+    *,
+    frame_points: FramePoints = NO_FRAME_POINTS,
 ) -> tuple[Tracks, Sensing, dict]:
     """Adjust the map, find what of the camera suits it, and again; returns tracks, what was found, and the evidence.
 
     sensing : what is known of the camera before. The motion in it comes from poses, the poses from features that it corrected: two
     rounds bring both to rest.
     """
-    kfs, given, cost = np.arange(len(builder.kf), dtype=np.int32), sensing.camera, []
+    kfs, given, cost = np.arange(len(sparse_map.kf), dtype=np.int32), sensing.camera, []
     prior = self_calibration.unknowns(given, cfg.optimize)
     for _ in range(cfg.optimize.rounds if prior else 0):
-        builder.features = self_calibration.correct(features, given, sensing)
-        result = map_adjustment.adjust(builder, kfs, sensing.camera, cfg.sensor, max_iterations=cfg.optimize.iterations)
-        found = self_calibration.estimate_sensing(builder, given, sensing, cfg.sensor, prior=prior)
+        sparse_map.features = self_calibration.correct(features, given, sensing)
+        result = map_adjustment.adjust(sparse_map, kfs, sensing.camera, cfg.sensor, max_iterations=cfg.optimize.iterations)
+        found = self_calibration.estimate_sensing(sparse_map, given, sensing, cfg.sensor, prior=prior)
         if result is None or found is None:
             break
-        twist = rolling_shutter.frame_twists(features.stamp, tracks, builder.snapshot())
+        twist = rolling_shutter.frame_twists(features.stamp, tracks, sparse_map.snapshot())
         sensing = replace(found, timing=replace(found.timing, twist=twist))
         cost.append(result.cost[-1])
-    builder.features = self_calibration.correct(features, given, sensing)
-    tracks, result = final_refinement.look_again(
-        builder,
+    sparse_map.features = self_calibration.correct(features, given, sensing)
+    tracks, result = final_refinement.refine_all(
+        sparse_map,
         tracks,
         sensing,
         cfg.sensor,
         cfg.track,
-        reliefs=reliefs,
-        shape_edges=cfg.optimize.shape_edges,
+        frame_points=frame_points,
+        depth_icp_edges=cfg.optimize.depth_icp_edges,
         iterations=cfg.optimize.iterations,
         progress=tools.progress,
         workers=tools.workers,

@@ -9,8 +9,8 @@ from slamcli import artifacts
 from slamcli.config.options import Config
 from slamcli.schema import (
     LOST,
-    ON_SHAPE,
-    RELOCALISED,
+    ON_DEPTH,
+    RELOCALIZED,
     CoarseDepth,
     Features,
     Matches,
@@ -19,7 +19,7 @@ from slamcli.schema import (
 )
 from slamcli.slam import map_segments, moving_objects
 from slamcli.slam.background_motion import BackgroundMotion
-from slamcli.slam.depth_tracking import Reliefs
+from slamcli.slam.depth_tracking import FramePoints
 from slamcli.slam.tracker import Tracker
 from slamcli.stages import moving_parts
 from slamcli.stages.contract import Inputs, Summary, Tools
@@ -48,8 +48,8 @@ def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
         "frames": len(features.stamp),
         "tracked": int((tracks.state != LOST).sum()),
         "lost": int((tracks.state == LOST).sum()),
-        "relocalised": int((tracks.state == RELOCALISED).sum()),
-        "on_shape": int((tracks.state == ON_SHAPE).sum()),
+        "relocalized": int((tracks.state == RELOCALIZED).sum()),
+        "on_depth": int((tracks.state == ON_DEPTH).sum()),
         "segments": map_segments.n_segments(map_),
         "key_frames": len(map_.kf_frame),
         "landmarks": len(map_.lm_xyz),
@@ -78,7 +78,7 @@ def _track(inputs: Inputs, moving: Moving, background: np.ndarray | None, cfg: C
     features, depth = moving_parts.still(inputs, moving)
     tracker = Tracker(
         features, inputs.load(Words, "match"), inputs.load(Matches, "match"), inputs.camera(), cfg.track, cfg.sensor, tools.rng(),
-        reliefs=Reliefs(depth, inputs.camera(), cfg.sensor), background=background,
+        frame_points=FramePoints(depth, inputs.camera(), cfg.sensor), background=background,
     )  # fmt: skip
     for i in tools.progress(range(len(features.stamp)), "track"):
         tracker.process(i)

@@ -18,7 +18,7 @@ _PAIR_X, _PAIR_Y = (PAIRS[:, :, axis].T.ravel().astype(np.float32) for axis in (
 
 
 def _disc() -> np.ndarray:
-    """Give the half width of each row 0..15 of the disc, made symmetric about the diagonal as in OpenCV."""
+    """Return the half width of each row 0..15 of the disc, made symmetric about the diagonal as in OpenCV."""
     half = np.zeros(PATCH_RADIUS + 1, dtype=np.int32)
     middle = int(np.floor(PATCH_RADIUS * np.sqrt(0.5) + 1))
     for v in range(middle + 1):
@@ -33,7 +33,7 @@ def _disc() -> np.ndarray:
 
 
 def _disc_mask() -> np.ndarray:
-    """Give the disc as 255 within 31 rows of 32 pixels: a row is one vector register, so that no row needs a length of its own."""
+    """Return the disc as 255 within 31 rows of 32 pixels: a row is one vector register, so that no row needs a length of its own."""
     mask = np.zeros((2 * PATCH_RADIUS + 1, 2 * PATCH_RADIUS + 2), dtype=np.uint8)
     for row, half in enumerate(_disc()[abs(v)] for v in range(-PATCH_RADIUS, PATCH_RADIUS + 1)):
         mask[row, PATCH_RADIUS - half : PATCH_RADIUS + half + 1] = 255
@@ -98,14 +98,14 @@ def _describe(
 
 
 def orientation(image: np.ndarray, xy: np.ndarray) -> np.ndarray:
-    """Give the orientation (N,) float32 [rad] of points xy (N, 2) int32 of a grey image."""
+    """Return the orientation (N,) float32 [rad] of points xy (N, 2) int32 of a grey image."""
     angle = np.empty(len(xy), dtype=np.float32)
     _orient(image, xy, _MASK, angle)
     return angle
 
 
 def descriptors(smooth: np.ndarray, xy: np.ndarray, angle: np.ndarray) -> np.ndarray:
-    """Give the descriptors (N, 32) uint8 of points xy (N, 2) int32 with orientation angle (N,) [rad] of a blurred image."""
+    """Return the descriptors (N, 32) uint8 of points xy (N, 2) int32 with orientation angle (N,) [rad] of a blurred image."""
     desc = np.empty((len(xy), 32), dtype=np.uint8)
     _describe(smooth.ravel(), smooth.shape[1], xy, angle, _PAIR_X, _PAIR_Y, np.empty(512, dtype=np.uint32), desc)
     return desc

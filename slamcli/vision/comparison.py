@@ -29,7 +29,7 @@ def evenness(xy: np.ndarray, width: int, height: int, *, cell: int = CELL) -> Ev
 
 
 def plain_orb(grey: np.ndarray, features: int = 1000) -> KeyPoints:
-    """Give the key points of OpenCV's ORB at its own settings."""
+    """Return the key points of OpenCV's ORB at its own settings."""
     points, desc = cv2.ORB.create(features).detectAndCompute(grey, None)
     return KeyPoints(
         xy=np.array([p.pt for p in points], dtype=np.float32).reshape(-1, 2),

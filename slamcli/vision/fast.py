@@ -19,43 +19,43 @@ SEVEN, EIGHT = np.uintp(7), np.uintp(8)
 BYTE, EIGHTH, WHOLE_BYTES = np.uint64(255), np.uint64(3), np.uint64(56)
 
 
-def _low(builder, a, b):
-    return builder.select(builder.icmp_unsigned("<", a, b), a, b)
+def _low(sparse_map, a, b):
+    return sparse_map.select(sparse_map.icmp_unsigned("<", a, b), a, b)
 
 
-def _high(builder, a, b):
-    return builder.select(builder.icmp_unsigned(">", a, b), a, b)
+def _high(sparse_map, a, b):
+    return sparse_map.select(sparse_map.icmp_unsigned(">", a, b), a, b)
 
 
 @intrinsic
 def _highest(_typing, a, b):
-    """Give the greater of two uint8."""
-    return types.uint8(types.uint8, types.uint8), lambda _context, builder, _signature, pair: _high(builder, *pair)
+    """Return the greater of two uint8."""
+    return types.uint8(types.uint8, types.uint8), lambda _context, sparse_map, _signature, pair: _high(sparse_map, *pair)
 
 
 @intrinsic
 def _score(_typing, centre, circle):
-    """Give the FAST-9 score of a pixel, uint8, and its circle, 16 uint8.
+    """Return the FAST-9 score of a pixel, uint8, and its circle, 16 uint8.
 
     A run of nine that starts at an odd place k is the eight from k and one of the two beside them, so eight runs of eight, built by doubling,
     give all sixteen runs of nine. Written straight into the instructions of the kernel: as two hundred calls of Python they took
     0.5 s longer to compile.
     """
 
-    def best_run(builder, p, least, most):
-        twos = [least(builder, p[k], p[(k + 1) % 16]) for k in range(1, 16, 2)]
-        fours = [least(builder, twos[k], twos[(k + 1) % 8]) for k in range(8)]
-        eights = [least(builder, fours[k], fours[(k + 2) % 8]) for k in range(8)]
-        nines = [least(builder, eights[k], most(builder, p[2 * k], p[(2 * k + 9) % 16])) for k in range(8)]
+    def best_run(sparse_map, p, least, most):
+        twos = [least(sparse_map, p[k], p[(k + 1) % 16]) for k in range(1, 16, 2)]
+        fours = [least(sparse_map, twos[k], twos[(k + 1) % 8]) for k in range(8)]
+        eights = [least(sparse_map, fours[k], fours[(k + 2) % 8]) for k in range(8)]
+        nines = [least(sparse_map, eights[k], most(sparse_map, p[2 * k], p[(2 * k + 9) % 16])) for k in range(8)]
         while len(nines) > 1:
-            nines = [most(builder, a, b) for a, b in zip(nines[::2], nines[1::2], strict=True)]
+            nines = [most(sparse_map, a, b) for a, b in zip(nines[::2], nines[1::2], strict=True)]
         return nines[0]
 
-    def generate(_context, builder, _signature, arguments):
-        c, p = arguments[0], [builder.extract_value(arguments[1], k) for k in range(16)]
-        brighter = builder.sub(_high(builder, best_run(builder, p, _low, _high), c), c)
-        darker = builder.sub(c, _low(builder, best_run(builder, p, _high, _low), c))
-        return _high(builder, brighter, darker)
+    def generate(_context, sparse_map, _signature, arguments):
+        c, p = arguments[0], [sparse_map.extract_value(arguments[1], k) for k in range(16)]
+        brighter = sparse_map.sub(_high(sparse_map, best_run(sparse_map, p, _low, _high), c), c)
+        darker = sparse_map.sub(c, _low(sparse_map, best_run(sparse_map, p, _high, _low), c))
+        return _high(sparse_map, brighter, darker)
 
     return types.uint8(types.uint8, types.UniTuple(types.uint8, 16)), generate
 
@@ -94,7 +94,7 @@ def corner_score(image: np.ndarray, box: np.ndarray, margin: int, score: np.ndar
 @intrinsic
 def _trailing_zeros(_typing, word):
     """Count the bits below the lowest set one of a uint64, as one instruction."""
-    return types.uint64(types.uint64), lambda context, builder, _signature, word: builder.cttz(
+    return types.uint64(types.uint64), lambda context, sparse_map, _signature, word: sparse_map.cttz(
         word[0], context.get_constant(types.boolean, 1)
     )
 
@@ -217,7 +217,7 @@ def _response(image, xy, out):
 
 
 def _quadratic_fit() -> np.ndarray:
-    """Give the (25, 5) weights that turn 5 x 5 values into b_x, b_y, a_xx, a_yy, a_xy of the parabola of least weighted squares."""
+    """Return the (25, 5) weights that turn 5 x 5 values into b_x, b_y, a_xx, a_yy, a_xy of the parabola of least weighted squares."""
     v, u = (axis.ravel() for axis in np.mgrid[-2:3, -2:3].astype(np.float64))
     terms = np.stack([np.ones(25), u, v, 0.5 * u * u, 0.5 * v * v, u * v], axis=1)
     root = np.exp(-0.25 * (u * u + v * v))  # square root of a Gaussian weight of 1 px
@@ -259,7 +259,7 @@ class Corners:
     score: np.ndarray  # (H, W) uint8 canvas, FAST score
 
     def summits(self, rows: np.ndarray) -> np.ndarray:
-        """Give the sub-pixel places (N, 2) float64 [px] on the canvas of the chosen corners."""
+        """Return the sub-pixel places (N, 2) float64 [px] on the canvas of the chosen corners."""
         out = np.empty((len(rows), 2))
         _summit(self.score, self.xy.take(rows, axis=0), _FIT, out)
         return out

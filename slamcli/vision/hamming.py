@@ -28,7 +28,7 @@ def _compare(
     following: i4[::1],
     choice: i4[::1],
 ):
-    """Keep for each row of i the smallest distance, whose it is, and the next smallest of another row; and for each entry of j the smallest.
+    """Update each row's best and second-best match, and the best distance of each column.
 
     desc_i : (N, 4) uint64; block : (N, B, 2) int32, start and stop of the entries each row of i is compared with
     desc_j : (4, E) uint64, entries, those of a node side by side; row_of_entry : (E,) int32, a row of j may have several
@@ -167,7 +167,7 @@ def match_nodes(
 
 
 def _two_nodes(node: np.ndarray) -> np.ndarray:
-    """Give nodes (N, 2) int32 from (N,) or (N, 2); -1 stands for no second."""
+    """Return nodes (N, 2) int32 from (N,) or (N, 2); -1 stands for no second."""
     node = np.ascontiguousarray(node, dtype=np.int32)
     return node if node.ndim == 2 else np.stack([node, np.full_like(node, -1)], axis=1)
 

@@ -10,7 +10,7 @@ import numpy as np
 from slamcli.errors import SlamError
 from slamcli.geometry.bits import hamming
 from slamcli.jit.kernel import kernel
-from slamcli.vision.vocabulary import MAX_NODES, Vocabulary, check, quantise
+from slamcli.vision.vocabulary import MAX_NODES, Vocabulary, check, quantize
 
 
 @kernel
@@ -134,8 +134,8 @@ def train(
 
 
 def document_frequency(vocabulary: Vocabulary, descriptors: list[np.ndarray]) -> np.ndarray:
-    """Give each word's weight (W,) float32: ln(images / images that hold it); a word of every image weighs nothing."""
+    """Return each word's weight (W,) float32: ln(images / images that hold it); a word of every image weighs nothing."""
     n_images = np.zeros(vocabulary.n_words, dtype=np.int64)
     for desc in descriptors:
-        n_images[np.unique(quantise(vocabulary, desc)[0])] += 1
+        n_images[np.unique(quantize(vocabulary, desc)[0])] += 1
     return np.log(len(descriptors) / np.maximum(n_images, 1)).astype(np.float32)

@@ -86,7 +86,7 @@ def detect(
 
 
 def no_key_points() -> KeyPoints:
-    """Give the result for an image without any."""
+    """Return the result for an image without any."""
     none = np.zeros(0, dtype=np.float32)
     return KeyPoints(xy=none.reshape(0, 2), octave=none.astype(np.uint8), angle=none, response=none, desc=np.zeros((0, 32), np.uint8))
 
@@ -132,7 +132,7 @@ _mine = threading.local()
 
 
 def _space(shape: tuple[int, int], levels: int, scale: float) -> _Space:
-    """Give this thread's work space for images of this size: the last one where it fits."""
+    """Return this thread's work space for images of this size: the last one where it fits."""
     key = (*shape, levels, scale)
     if getattr(_mine, "key", None) != key:
         _mine.key, _mine.space = key, _Space(pyramid.boxes(*shape, levels=levels, scale=scale, least=MIN_SIDE))

@@ -30,7 +30,7 @@ def canvas(box: np.ndarray) -> np.ndarray:
 
 
 def levels(image: np.ndarray, box: np.ndarray) -> list[np.ndarray]:
-    """Give the levels of a canvas, views."""
+    """Return the levels of a canvas, views."""
     return [image[top : top + height, :width] for top, height, width in box.tolist()]
 
 
@@ -54,7 +54,7 @@ class FullSize:
         self._first[:, 1] = box[:, TOP]
 
     def __call__(self, place: np.ndarray, octave: np.ndarray) -> np.ndarray:
-        """Give the pixels (N, 2) float32 of places (N, 2) float64 [px] of levels octave (N,) uint8."""
+        """Return the pixels (N, 2) float32 of places (N, 2) float64 [px] of levels octave (N,) uint8."""
         out = place - self._first.take(octave, axis=0)  # take: the index in brackets is six times slower
         out += 0.5
         out *= self._ratio.take(octave, axis=0)

@@ -29,7 +29,7 @@ def _grow(
     of the levels before it would all find room; child : (4, 2) int32 and rank : (rows of node,) int32, scratch
 
     Rounds: every node with more than one point splits in four, the fullest first, of equals the one with the lower row. The first child
-    that has points takes its parent's row, the others are appended. One kernel, without calls: each would be compiled and optimised again.
+    that has points takes its parent's row, the others are appended. One kernel, without calls: each would be compiled and optimized again.
     """
     base = 0
     for level in range(len(wanted)):

@@ -35,18 +35,18 @@ class Vocabulary:
 
     @property
     def n_words(self) -> int:
-        """Give the number of words."""
+        """Return the number of words."""
         return len(self.idf)
 
     @cached_property
     def word_of_node(self) -> np.ndarray:
-        """Give the word of each node, -1 for inner nodes, (V,) int32."""
+        """Return the word of each node, -1 for inner nodes, (V,) int32."""
         is_leaf = np.diff(self.first_child) == 0
         return np.where(is_leaf, np.cumsum(is_leaf) - 1, -1).astype(np.int32)
 
     @cached_property
     def level(self) -> np.ndarray:
-        """Give each node's distance from the root, (V,) int32."""
+        """Return each node's distance from the root, (V,) int32."""
         level = np.zeros(len(self.centre), dtype=np.int32)
         start, stop = 0, 1
         while stop > start:
@@ -56,23 +56,23 @@ class Vocabulary:
 
     @property
     def parent(self) -> np.ndarray:
-        """Give the parent of each node but the root, (V - 1,) int32."""
+        """Return the parent of each node but the root, (V - 1,) int32."""
         return np.repeat(np.arange(len(self.centre), dtype=np.int32), np.diff(self.first_child))
 
     @property
     def node_weight(self) -> np.ndarray:
-        """Give the weight of each node but the root, 0 for inner ones, (V - 1,) float32."""
+        """Return the weight of each node but the root, 0 for inner ones, (V - 1,) float32."""
         word = self.word_of_node[1:]
         return np.where(word >= 0, self.idf[word], np.float32(0))
 
     @property
     def branching(self) -> int:
-        """Give the largest number of children."""
+        """Return the largest number of children."""
         return int(np.diff(self.first_child).max())
 
     @property
     def depth(self) -> int:
-        """Give the number of levels below the root."""
+        """Return the number of levels below the root."""
         return int(self.level.max())
 
 
@@ -219,8 +219,8 @@ def _descend(
         word[k] = word_of_node[here]
 
 
-def quantise(vocabulary: Vocabulary, desc: np.ndarray, *, node_level: int = 1, margin: int = -1) -> tuple[np.ndarray, np.ndarray]:
-    """Give the word and the nodes `node_level` levels below the root (or the word's, where that comes sooner) of descriptors (N, 32) uint8.
+def quantize(vocabulary: Vocabulary, desc: np.ndarray, *, node_level: int = 1, margin: int = -1) -> tuple[np.ndarray, np.ndarray]:
+    """Return the word and the nodes `node_level` levels below the root (or the word's, where that comes sooner) of descriptors (N, 32) uint8.
 
     margin [bits] : a second node is given where it is at most this much farther; negative: never
     Returns word (N,) int32 and node (N, 2) int32: the nearest node and the second, -1 for none.
@@ -232,7 +232,7 @@ def quantise(vocabulary: Vocabulary, desc: np.ndarray, *, node_level: int = 1, m
 
 
 def word_vector(word: np.ndarray, idf: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Give the word vector of one frame: words (B,) int32 in increasing order and their tf-idf weights (B,) float32, which sum to 1.
+    """Return the word vector of one frame: words (B,) int32 in increasing order and their tf-idf weights (B,) float32, which sum to 1.
 
     Words of no weight are left out; a frame without features, or without any word of weight, has an empty vector.
     """
@@ -243,7 +243,7 @@ def word_vector(word: np.ndarray, idf: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 def word_vectors(word: np.ndarray, offset: np.ndarray, idf: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Give the word vectors of all frames: offset (F + 1,) int64, word (B,) int32, weight (B,) float32; `offset` delimits the frames' features."""
+    """Return the word vectors of all frames: offset (F + 1,) int64, word (B,) int32, weight (B,) float32; `offset` delimits the frames' features."""
     vectors = [word_vector(word[start:stop], idf) for start, stop in zip(offset[:-1], offset[1:], strict=True)]
     bow_offset = np.cumsum([0] + [len(words) for words, _ in vectors], dtype=np.int64)
     if not vectors:
@@ -292,7 +292,7 @@ class InvertedIndex:
         self._n_frames = max(self._n_frames, frame + 1)
 
     def query(self, word: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Give the frames that share a word with this vector, increasing (C,) int64, and their similarities (C,) float64 in (0, 1]; [Z] (10).
+        """Return the frames that share a word with this vector, increasing (C,) int64, and their similarities (C,) float64 in (0, 1]; [Z] (10).
 
         1/2 sum(|a| + |b| - |a - b|) is the sum of min(a, b), as weights are never negative.
         """

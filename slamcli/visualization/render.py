@@ -47,7 +47,7 @@ class _Eye:
     height: int
 
     def see(self, xyz: np.ndarray) -> np.ndarray:
-        """Give x, y [px] and depth [m] of points (N, 3), float32."""
+        """Return x, y [px] and depth [m] of points (N, 3), float32."""
         x_c = (xyz - self.centre_l) @ self.R_cl.T
         z = np.maximum(x_c[:, 2:], 1e-6)
         return np.hstack([x_c[:, :2] / z * self.focal + [self.width / 2, self.height / 2], x_c[:, 2:]]).astype(np.float32)
@@ -172,7 +172,7 @@ def _height_colours(z: np.ndarray, between: tuple[float, float] | None = None) -
 
 
 def _visible_faces(tree: Octree, threshold: float) -> tuple[np.ndarray, np.ndarray]:
-    """Give the occupied finest cells (N, 3) and whether each of their six neighbours is known to be free (N, 6)."""
+    """Return the occupied finest cells (N, 3) and whether each of their six neighbours is known to be free (N, 6)."""
     occupied = tree.is_occupied(threshold)
     n_cells = (1 << 3 * (DEPTH - tree.depth[occupied].astype(np.int64))).sum()
     if n_cells > MAX_CELLS:

@@ -113,7 +113,7 @@ def _log_maps(rr: Any, recording: Any, run: RunDir) -> None:
 
 
 def _occupied_boxes(run: RunDir) -> tuple[np.ndarray, np.ndarray]:
-    """Give centre (N, 3) and half sides (N, 3) [m] of the octree's occupied leaves."""
+    """Return centre (N, 3) and half sides (N, 3) [m] of the octree's occupied leaves."""
     tree = octomap.read(run.stage_path("octree", "map.ot"))
     rows = np.flatnonzero(tree.is_occupied())
     rows = rows[:: -(-len(rows) // MOST_CELLS) or 1]

@@ -51,7 +51,7 @@ def seen_of_a_plane(when: Timing, normal: np.ndarray, rng: np.random.Generator) 
     share = raw[:, 1] / CAMERA.height - 0.5
 
     def hit(seconds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Give the depth in the camera of that time and the point in that of the stamp."""
+        """Return the depth in the camera of that time and the point in that of the stamp."""
         T = se3.exp(seconds[:, None] * when.twist[0])
         towards = np.einsum("nij,nj->ni", T[:, :3, :3], ray)
         z = (1.0 - T[:, :3, 3] @ normal) / (towards @ normal)

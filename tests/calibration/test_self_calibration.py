@@ -14,7 +14,7 @@ from slamcli.geometry import se3
 from slamcli.geometry.camera import Camera
 from slamcli.schema import Features, Timing, frame_poses
 from slamcli.sparse_map import map_adjustment
-from slamcli.sparse_map.sparse_map import MapBuilder
+from slamcli.sparse_map.sparse_map import SparseMap
 from slamcli.stages import loop, optimize, track
 
 SENSOR = SensorConfig(depth_noise_base=0.0012, depth_noise_quadratic=0.0019, pixel_noise=0.5)  # the noise that `observe` makes
@@ -39,17 +39,17 @@ def shaking() -> Scene:
     return replace(made, features=replace(made.features, slope=slope.astype(np.float32)))
 
 
-def build(scene: Scene, features: Features) -> MapBuilder:
+def build(scene: Scene, features: Features) -> SparseMap:
     """Make every frame a key frame at its true pose, and every true landmark one of the map."""
-    builder, id_of = MapBuilder(features), np.full(len(scene.xyz), -1, np.int32)
+    sparse_map, id_of = SparseMap(features), np.full(len(scene.xyz), -1, np.int32)
     for frame, T_gc in enumerate(scene.T_gc):
-        kf = builder.add_key_frame(frame, T_gc)
+        kf = sparse_map.add_key_frame(frame, T_gc)
         rows = np.arange(features.offset[frame], features.offset[frame + 1])
         of = scene.landmark[rows]
         is_known = id_of[of] >= 0
-        builder.observe(kf, id_of[of[is_known]], rows[is_known])
-        id_of[of[~is_known]] = builder.add_landmarks(kf, rows[~is_known], scene.xyz[of[~is_known]])
-    return builder
+        sparse_map.observe(kf, id_of[of[is_known]], rows[is_known])
+        id_of[of[~is_known]] = sparse_map.add_landmarks(kf, rows[~is_known], scene.xyz[of[~is_known]])
+    return sparse_map
 
 
 def moving(scene: Scene, *, readout: float = 0.0, depth_readout: float = 0.0, depth_delay: float = 0.0) -> Timing:
@@ -61,12 +61,12 @@ def look(
     scene: Scene, features: Features, given: Camera, option: OptimizeConfig, *, rounds: int = 3, sensor: SensorConfig = SENSOR
 ) -> Sensing:
     """Adjust and estimate in turns, as optimize does."""
-    builder, sensing = build(scene, features), Sensing(given, moving(scene), {})
+    sparse_map, sensing = build(scene, features), Sensing(given, moving(scene), {})
     prior, kfs = self_calibration.unknowns(given, option), np.arange(len(scene.T_gc), dtype=np.int32)
     for _ in range(rounds):
-        builder.features = self_calibration.correct(features, given, sensing)
-        map_adjustment.adjust(builder, kfs, sensing.camera, sensor, max_iterations=15)
-        sensing = self_calibration.estimate_sensing(builder, given, sensing, sensor, prior=prior)
+        sparse_map.features = self_calibration.correct(features, given, sensing)
+        map_adjustment.adjust(sparse_map, kfs, sensing.camera, sensor, max_iterations=15)
+        sensing = self_calibration.estimate_sensing(sparse_map, given, sensing, sensor, prior=prior)
     return sensing
 
 

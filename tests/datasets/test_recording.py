@@ -55,7 +55,7 @@ def test_large_pictures_keep_their_rays(tmp_path: Path) -> None:
     centres = []
     for dataset in (small, large):
         v, u = np.nonzero(dataset.grey(0) > 128)
-        centres.append(dataset.camera.normalise(np.array([u.mean(), v.mean()])))
+        centres.append(dataset.camera.normalize(np.array([u.mean(), v.mean()])))
     np.testing.assert_allclose(centres[0], centres[1], atol=0.1 / 450)
 
 

@@ -131,10 +131,10 @@ def test_a_scan_too_large_for_memory_is_refused() -> None:
         OccupancyMap(0.01, **MODEL).insert(np.array([[300.0, 300.0, 300.0]]), np.zeros(3), max_range=0.0)
 
 
-def test_discretised_scans_cast_one_ray_to_each_end_cell() -> None:
+def test_discretized_scans_cast_one_ray_to_each_end_cell() -> None:
     points = np.array([[1.01, 0.51, 0.26], [1.02, 0.52, 0.27], [1.03, 0.53, 0.28]])
     both = [OccupancyMap(0.05, **MODEL) for _ in range(2)]
-    both[0].insert(points, np.zeros(3), max_range=3.0, discretise=True)
+    both[0].insert(points, np.zeros(3), max_range=3.0, discretize=True)
     both[1].insert(np.array([[1.025, 0.525, 0.275]]), np.zeros(3), max_range=3.0)
     assert np.array_equal(both[0].leaves().key, both[1].leaves().key)
 
@@ -155,16 +155,16 @@ def test_a_map_agrees_with_the_scan_it_was_made_from_and_not_with_its_opposite()
 
 
 @pytest.mark.parametrize("max_range", [-1.0, 1.6])
-@pytest.mark.parametrize("discretise", [False, True])
-def test_maps_are_those_of_the_octomap_library(max_range: float, discretise: bool, tmp_path) -> None:
+@pytest.mark.parametrize("discretize", [False, True])
+def test_maps_are_those_of_the_octomap_library(max_range: float, discretize: bool, tmp_path) -> None:
     pyoctomap = pytest.importorskip("pyoctomap", reason="the C++ library, in the extra 'test', is not installed")
     rng = np.random.default_rng(4)
     theirs, ours = pyoctomap.OcTree(0.05), OccupancyMap(0.05, **MODEL)
     for i in range(12):
         origin = np.array([0.11 * i, 0.03 * i, 0.02 * i])
         points = room_scan(rng, origin)
-        ours.insert(points, origin, max_range=max_range, discretise=discretise)
-        theirs.insertPointCloud(points.astype(np.float64), origin, max_range=max_range, discretize=discretise)
+        ours.insert(points, origin, max_range=max_range, discretize=discretize)
+        theirs.insertPointCloud(points.astype(np.float64), origin, max_range=max_range, discretize=discretize)
     theirs.updateInnerOccupancy()
     theirs.write(str(tmp_path / "theirs.ot"))
     octomap.write_ot(tmp_path / "ours.ot", prune(ours.leaves()))

@@ -15,7 +15,7 @@ HERE = look_along([2.0, 1.6, 1.0], 3.9, 0.3)  # into a corner
 LENS = Camera(160, 120, 147.3, 152.3, 79.5, 59.5, k1=0.2312, k2=-0.7849, p1=-0.0033, p2=-0.0001, k3=0.9172)
 
 
-def relief(T_lc: np.ndarray, seed: int | None = None, **scene) -> icp.Relief:
+def relief(T_lc: np.ndarray, seed: int | None = None, **scene) -> icp.OrientedPoints:
     depth = render(T_lc, KINECT, **scene)
     return icp.relief(icp.coarse(depth if seed is None else noisy(depth, seed)), KINECT, SENSOR)
 

@@ -19,7 +19,7 @@ def full_system(scene: Scene, T: np.ndarray, x: np.ndarray, limits=LIMITS) -> tu
 # --- kernels against their slow twins
 
 
-def linearised(scene: Scene) -> bundle_adjustment.Problem:
+def linearized(scene: Scene) -> bundle_adjustment.Problem:
     problem = bundle_adjustment.Problem(*scene.problem, np.zeros(len(scene.T_cw), dtype=bool))
     problem.linearize(problem.T, problem.x, np.array(LIMITS))
     return problem
@@ -28,7 +28,7 @@ def linearised(scene: Scene) -> bundle_adjustment.Problem:
 def test_blocks_equal_numerical_derivatives():
     scene = drive(3, 25, share=0.7)
     H, b = full_system(scene, scene.T_cw, scene.x_w)
-    problem = linearised(scene)
+    problem = linearized(scene)
     n, scale = 18, {"rtol": 1e-5, "atol": 1e-6 * np.abs(H).max()}
     for k in range(3):
         np.testing.assert_allclose(np.triu(problem.U[k]), np.triu(H[6 * k : 6 * k + 6, 6 * k : 6 * k + 6]), **scale)
@@ -84,13 +84,13 @@ def test_every_form_of_the_reduced_system_solves_it(n, form):
         system.blocks[s] = np.triu(block) + np.tril(np.full((6, 6), 1e6), -1) if r == c else block  # below the diagonal nothing counts
     rhs = rng.normal(size=(6 * n, 3))
     system.form = form
-    np.testing.assert_allclose(system.factorise().solve(rhs), np.linalg.solve(whole, rhs), rtol=1e-6, atol=1e-10)
+    np.testing.assert_allclose(system.factorize().solve(rhs), np.linalg.solve(whole, rhs), rtol=1e-6, atol=1e-10)
 
 
 def test_an_indefinite_system_is_reported():
     system = reduced_camera_system.ReducedSystem(np.array([0]), np.array([0]), 1)
     system.blocks[0] = -np.eye(6)
-    assert system.factorise() is None
+    assert system.factorize() is None
 
 
 def test_key_frames_are_ordered_into_a_band():
@@ -119,7 +119,7 @@ def test_cost_does_not_feel_where_the_world_stands():
 
 def test_the_reduced_system_has_six_free_directions_when_nothing_is_fixed():
     scene = drive(5, 80, noise=0.0, start=0.0)
-    problem = linearised(scene)
+    problem = linearized(scene)
     problem.eliminate(0.0, np.zeros(5))
     S = problem.system._dense()
     S = np.triu(S) + np.triu(S, 1).T
@@ -251,7 +251,7 @@ def test_long_drives_take_the_same_road_as_short_ones(n_kf):
     problem = bundle_adjustment.Problem(*scene.problem, scene.first)
     assert problem.system.form == "band"
     problem.system.form = "dense"
-    T, _, cost, *_ = bundle_adjustment._minimise(problem, problem.T, problem.x, np.array(LIMITS), 4, 0.0)
+    T, _, cost, *_ = bundle_adjustment._minimize(problem, problem.T, problem.x, np.array(LIMITS), 4, 0.0)
     np.testing.assert_allclose(result.T_cw, T, rtol=1e-5, atol=1e-5)  # rounding, along a drive of up to 128 m
     np.testing.assert_allclose(result.cost, cost, rtol=1e-9)
 

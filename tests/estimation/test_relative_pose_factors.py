@@ -25,7 +25,7 @@ def chain(T_true: np.ndarray, rng: np.random.Generator, *, noise: float = 1.0, r
 
 
 def blank(T_cw: np.ndarray) -> tuple:
-    """Give a bundle problem without any landmark."""
+    """Return a bundle problem without any landmark."""
     nothing = np.empty(0)
     seen = Observations(nothing.astype(int), nothing.astype(int), np.empty((0, 2)), nothing, nothing, nothing)
     return T_cw, np.empty((0, 3)), seen, CAMERA
@@ -150,7 +150,7 @@ def test_without_edges_nothing_changes_and_many_key_frames_take_the_same_road(n_
         result = bundle_adjustment.adjust(*scene.problem, is_fixed=scene.first, edges=edges, max_iterations=4, tolerance=0.0)
         problem = bundle_adjustment.Problem(*scene.problem, scene.first, edges)
         problem.system.form = "dense"
-        _, _, cost, *_ = bundle_adjustment._minimise(
+        _, _, cost, *_ = bundle_adjustment._minimize(
             problem, problem.T, problem.x, np.array([bundle_adjustment.CHI2_95_2DOF, bundle_adjustment.CHI2_95_3DOF]), 4, 0.0
         )
         np.testing.assert_allclose(result.cost, cost, rtol=1e-9)
@@ -164,5 +164,5 @@ def test_g2o_reaches_the_same_cost():
     edges = chain(scene.T_true, np.random.default_rng(6), reach=3)
     ours = bundle_adjustment.adjust(*blank(scene.T_cw), is_fixed=scene.first, edges=edges, robust=False, max_iterations=50, tolerance=1e-13)
     peer = pose_graph.optimize(se3.inverse(scene.T_cw), edges.kf, edges.T_ij, edges.information, is_fixed=scene.first, iterations=50)
-    np.testing.assert_allclose(ours.cost[-1], peer.cost, rtol=1e-3)  # g2o minimises a residual that differs in the second order
+    np.testing.assert_allclose(ours.cost[-1], peer.cost, rtol=1e-3)  # g2o minimizes a residual that differs in the second order
     np.testing.assert_allclose(se3.inverse(peer.T_wk), ours.T_cw, atol=2e-4)

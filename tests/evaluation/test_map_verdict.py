@@ -24,7 +24,7 @@ SETTINGS, SENSOR = GridConfig(), SensorConfig()
 
 
 def recorded(T_lc, *, boxes=FURNITURE, far=4.0, holes=0.0, seed=0):
-    """Give the noisy depth of every pose; a share `holes` of the pixels is lost in blocks, as on glass."""
+    """Return the noisy depth of every pose; a share `holes` of the pixels is lost in blocks, as on glass."""
     rng = np.random.default_rng(seed)
     images = []
     for T in T_lc:

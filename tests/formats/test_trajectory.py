@@ -38,7 +38,7 @@ def test_comments_separators_and_byte_order_mark(tmp_path: Path) -> None:
     trajectory = read_tum(path)
     assert trajectory.stamp.tolist() == [1.5, 2.5]  # sorted
     np.testing.assert_allclose(trajectory.T_wc[:, :3, 3], [[1, 2, 3], [1, 2, 3]])
-    np.testing.assert_allclose(trajectory.T_wc[1, :3, :3], np.eye(3))  # the quaternion is normalised
+    np.testing.assert_allclose(trajectory.T_wc[1, :3, :3], np.eye(3))  # the quaternion is normalized
 
 
 def test_the_first_of_equal_stamps_counts(tmp_path: Path) -> None:

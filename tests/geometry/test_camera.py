@@ -131,7 +131,7 @@ def test_a_camera_file_of_a_plain_lens_keeps_its_keys():
 def test_a_scaled_camera_sees_the_same_rays_in_other_pixels():
     half = FREIBURG1.scaled(320, 240)
     xy = np.array([[100.0, 50.0], [619.0, 460.0]])
-    np.testing.assert_allclose(half.normalise((xy + 0.5) / 2 - 0.5), FREIBURG1.normalise(xy), atol=1e-12)
+    np.testing.assert_allclose(half.normalize((xy + 0.5) / 2 - 0.5), FREIBURG1.normalize(xy), atol=1e-12)
     assert half.scaled(640, 480).to_dict() == pytest.approx(FREIBURG1.to_dict())
     with pytest.raises(SlamError, match="another shape"):
         FREIBURG1.scaled(640, 400)
@@ -143,7 +143,7 @@ def test_a_turned_camera_sees_the_same_rays_turned():
     assert (turned.width, turned.height) == (480, 640)
     x, y = 100.0, 50.0
     np.testing.assert_allclose(
-        turned.normalise(np.array([479.0 - y, x])), [-camera.normalise(np.array([x, y]))[1], camera.normalise(np.array([x, y]))[0]]
+        turned.normalize(np.array([479.0 - y, x])), [-camera.normalize(np.array([x, y]))[1], camera.normalize(np.array([x, y]))[0]]
     )
 
 

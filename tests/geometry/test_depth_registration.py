@@ -37,7 +37,7 @@ def naively(depth: np.ndarray, given: Registration) -> np.ndarray:
             d = float(depth[row, column])
             if not d > 0:
                 continue
-            ray = of.normalise(np.array([[column, row]], dtype=float))[0]
+            ray = of.normalize(np.array([[column, row]], dtype=float))[0]
             x = given.T_cd[:3, :3] @ (d * np.array([*ray, 1.0])) + given.T_cd[:3, 3]
             u, v = to.distort(to.project(x))
             if x[2] <= 0 or not (-0.5 < u < to.width - 0.5 and -0.5 < v < to.height - 0.5):

@@ -189,7 +189,7 @@ def test_image_gradient_is_the_step_from_the_upper_neighbour():
         np.testing.assert_array_equal(gradient[row], expected)
 
 
-def test_fit_plane_minimises_the_sum_of_distances():
+def test_fit_plane_minimizes_the_sum_of_distances():
     rng = np.random.default_rng(4)
     normal = np.array([0.1, -0.2, 1.0]) / np.linalg.norm([0.1, -0.2, 1.0])
     x = rng.uniform(-2, 2, (400, 3))

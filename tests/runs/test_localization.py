@@ -1,4 +1,4 @@
-"""A recording localised in a run: its own frames are found where the run has them, and what shows another place is refused."""
+"""A recording localized in a run: its own frames are found where the run has them, and what shows another place is refused."""
 
 import json
 import shutil
@@ -41,10 +41,10 @@ def test_frames_are_found_where_the_run_has_them(slamcli, room, room_run, tmp_pa
     assert {path: path.stat().st_mtime_ns for path in room_run.rglob("*")} == before
 
 
-def test_another_place_is_not_recognised(room_run, tmp_path):
+def test_another_place_is_not_recognized(room_run, tmp_path):
     noise = open_dataset(str(write_recording(tmp_path / "noise", frames=3)))
-    with pytest.raises(SlamError, match="no frame was recognised in the map of"):
-        localization.localise(RunDir(room_run), noise, progress=lambda items, label, total=None: items)
+    with pytest.raises(SlamError, match="no frame was recognized in the map of"):
+        localization.localize(RunDir(room_run), noise, progress=lambda items, label, total=None: items)
 
 
 def test_a_run_without_a_map_says_what_to_do(slamcli, room, room_run, tmp_path):

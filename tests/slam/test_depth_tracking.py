@@ -12,12 +12,12 @@ from slamcli.calibration.self_calibration import Sensing
 from slamcli.config.options import LoopConfig, SensorConfig, TrackConfig
 from slamcli.depth import icp
 from slamcli.geometry import se3
-from slamcli.schema import KEY_FRAME, LOST, ON_SHAPE, CoarseDepth, Features, Matches, Timing, Tracks, Words, frame_poses
+from slamcli.schema import KEY_FRAME, LOST, ON_DEPTH, CoarseDepth, Features, Matches, Timing, Tracks, Words, frame_poses
 from slamcli.slam import final_refinement, loop_closing
-from slamcli.slam.depth_tracking import Reliefs, Shape
+from slamcli.slam.depth_tracking import FramePoints, Shape
 from slamcli.slam.tracker import Tracker
 from slamcli.sparse_map import map_adjustment
-from slamcli.sparse_map.sparse_map import MapBuilder
+from slamcli.sparse_map.sparse_map import SparseMap
 
 SENSOR = SensorConfig()
 RATE = 15.0
@@ -25,7 +25,7 @@ WALL = (((3.0, -20.0, -20.0), (3.2, 20.0, 20.0)),)
 
 
 def turn(n: int, start: float = 3.6, step: float = 0.05) -> np.ndarray:
-    """Give T_lc (n, 4, 4) of a camera that drives through a room's corner and turns."""
+    """Return T_lc (n, 4, 4) of a camera that drives through a room's corner and turns."""
     return np.array([look_along([2.2 - 0.02 * k, 1.7 + 0.1 * np.sin(0.3 * k), 0.9], start + step * k, 0.3) for k in range(n)])
 
 
@@ -35,7 +35,7 @@ def corner(n: int = 14) -> CoarseDepth:
 
 
 def blind(n: int) -> tuple[Features, Words, Matches]:
-    """Give what extract and match make of n dark pictures."""
+    """Return what extract and match make of n dark pictures."""
     none, stamp = np.zeros(0), 10.0 + np.arange(n) / RATE
     features = Features(
         stamp=stamp, depth_stamp=stamp.copy(), offset=np.zeros(n + 1, np.int64), xy=np.zeros((0, 2), np.float32),
@@ -50,8 +50,10 @@ def blind(n: int) -> tuple[Features, Words, Matches]:
 
 def track(depth: CoarseDepth, **settings) -> Tracker:
     features, words, matches = blind(len(depth.coarse_depth))
-    reliefs = Reliefs(depth, KINECT, SENSOR)
-    tracker = Tracker(features, words, matches, KINECT, TrackConfig(**settings), SENSOR, np.random.default_rng(0), reliefs=reliefs)
+    frame_points = FramePoints(depth, KINECT, SENSOR)
+    tracker = Tracker(
+        features, words, matches, KINECT, TrackConfig(**settings), SENSOR, np.random.default_rng(0), frame_points=frame_points
+    )
     for i in range(len(depth.coarse_depth)):
         tracker.process(i)
     return tracker
@@ -60,7 +62,7 @@ def track(depth: CoarseDepth, **settings) -> Tracker:
 def test_a_drive_in_the_dark_is_followed():
     tracker = track(corner())
     tracks, map_ = tracker.tracks(), tracker.map()
-    assert set(tracks.state) == {KEY_FRAME, ON_SHAPE} and tracks.state[0] == KEY_FRAME
+    assert set(tracks.state) == {KEY_FRAME, ON_DEPTH} and tracks.state[0] == KEY_FRAME
     assert 1e-5 < ape(frame_poses(tracks, map_), turn(14)) < 0.01
     assert 2 <= len(map_.kf_frame) < 8 and len(map_.edge_kf) >= len(map_.kf_frame) - 1
     assert (map_.edge_kf[:, 0] > map_.edge_kf[:, 1]).all() and len(map_.lm_xyz) == 0
@@ -68,19 +70,19 @@ def test_a_drive_in_the_dark_is_followed():
 
 def test_edges_survive_the_map_and_hold_it_in_the_adjustment_and_in_the_pose_graph():
     map_ = track(corner()).map()
-    builder = MapBuilder.from_map(blind(14)[0], map_)
-    again = builder.snapshot()
+    sparse_map = SparseMap.from_map(blind(14)[0], map_)
+    again = sparse_map.snapshot()
     for name in ("edge_kf", "edge_T_ij", "edge_information"):
         assert getattr(again, name).tobytes() == getattr(map_, name).tobytes()
-    good = builder.kf.T_wk.copy()
-    builder.kf.T_wk[1:] = se3.exp(np.random.default_rng(0).normal(size=(len(good) - 1, 6)) * 0.02) @ builder.kf.T_wk[1:]
-    result = map_adjustment.adjust(builder, np.arange(len(good), dtype=np.int32), KINECT, SENSOR, max_iterations=30)
+    good = sparse_map.kf.T_wk.copy()
+    sparse_map.kf.T_wk[1:] = se3.exp(np.random.default_rng(0).normal(size=(len(good) - 1, 6)) * 0.02) @ sparse_map.kf.T_wk[1:]
+    result = map_adjustment.adjust(sparse_map, np.arange(len(good), dtype=np.int32), KINECT, SENSOR, max_iterations=30)
     assert result.cost[-1] < 0.05 * result.cost[0]
-    assert np.abs(se3.log(builder.kf.T_wk @ se3.inverse(good))).max() < 0.01
-    edges, support = loop_closing.covisibility_edges(builder, LoopConfig())
-    on_shape = {tuple(pair) for pair in map_.edge_kf.tolist()}
-    assert on_shape <= {tuple(pair) for pair in edges.tolist()}
-    assert all(n >= loop_closing.SHAPE_SUPPORT for pair, n in zip(edges.tolist(), support, strict=True) if tuple(pair) in on_shape)
+    assert np.abs(se3.log(sparse_map.kf.T_wk @ se3.inverse(good))).max() < 0.01
+    edges, support = loop_closing.covisibility_edges(sparse_map, LoopConfig())
+    on_depth = {tuple(pair) for pair in map_.edge_kf.tolist()}
+    assert on_depth <= {tuple(pair) for pair in edges.tolist()}
+    assert all(n >= loop_closing.SHAPE_SUPPORT for pair, n in zip(edges.tolist(), support, strict=True) if tuple(pair) in on_depth)
 
 
 def test_same_input_same_bytes():
@@ -107,11 +109,11 @@ def past_a_box(n: int = 16) -> tuple[CoarseDepth, np.ndarray]:
 @pytest.mark.parametrize("hold", [0.0, 0.2, 1.0])
 def test_along_a_flat_wall_the_motion_goes_on_for_a_while(hold):
     depth, T_gc = past_a_box()
-    tracker = track(depth, shape_hold=hold)
+    tracker = track(depth, depth_icp_hold=hold)
     tracks = tracker.tracks()
     lost = np.flatnonzero(tracks.state == LOST)
     held = round(hold * RATE)  # frames
-    first = int(np.flatnonzero(track(depth, shape_hold=0.0).tracks().state == LOST)[0])
+    first = int(np.flatnonzero(track(depth, depth_icp_hold=0.0).tracks().state == LOST)[0])
     np.testing.assert_array_equal(lost, np.arange(min(first + held, 16), 16))
     assert 3 < first < 14 and all("5 of 6 directions" in tracker.lost_reason[int(i)] for i in lost)
     T_wc = frame_poses(tracks, tracker.map())[: min(first + held, 16)]
@@ -137,32 +139,32 @@ def test_frames_without_depth_are_lost_and_found_again():
 
 def test_key_frames_are_joined_only_where_they_show_the_same():
     depth = corner()
-    builder = MapBuilder(blind(14)[0])
+    sparse_map = SparseMap(blind(14)[0])
     T_wc = turn(14)
     for frame in (0, 2, 13):
-        builder.add_key_frame(frame, T_wc[frame])
-    reliefs = Reliefs(depth, KINECT, SENSOR)
-    shape = Shape(builder, reliefs, reliefs)
+        sparse_map.add_key_frame(frame, T_wc[frame])
+    frame_points = FramePoints(depth, KINECT, SENSOR)
+    shape = Shape(sparse_map, frame_points, frame_points)
     assert shape.join_pair(1, 0)
-    e = se3.log(builder.edge.T_ij[0] @ se3.inverse(T_wc[0]) @ T_wc[2])
+    e = se3.log(sparse_map.edge.T_ij[0] @ se3.inverse(T_wc[0]) @ T_wc[2])
     assert np.linalg.norm(e) < 0.006
-    builder.kf.T_wk[2] = se3.exp([2.0, 0.0, 0.0, 0.0, 0.0, 0.0]) @ builder.kf.T_wk[2]
-    assert not shape.join_pair(2, 0) and shape.join(2) == 0 and len(builder.edge) == 1
+    sparse_map.kf.T_wk[2] = se3.exp([2.0, 0.0, 0.0, 0.0, 0.0, 0.0]) @ sparse_map.kf.T_wk[2]
+    assert not shape.join_pair(2, 0) and shape.join(2) == 0 and len(sparse_map.edge) == 1
 
 
 def test_edges_hold_for_the_instants_of_the_colour_images():
     """The depth cameras stand where they stand; the key frames, elsewhere on the way."""
     T_wd, T_cd = turn(14), se3.exp(np.array([[0.01, -0.02, 0.03, 0.02, -0.03, 0.01], [-0.02, 0.01, 0.0, 0.0, 0.03, 0.02]]))
-    builder = MapBuilder(blind(14)[0])
+    sparse_map = SparseMap(blind(14)[0])
     for kf, frame in enumerate((0, 2)):
-        builder.add_key_frame(frame, T_wd[frame] @ se3.inverse(T_cd[kf]))
-    reliefs = Reliefs(corner(), KINECT, SENSOR)
-    assert Shape(builder, reliefs, reliefs).join_pair(1, 0, T_cd)
-    e = se3.log(builder.edge.T_ij[0] @ se3.inverse(builder.kf.T_wk[0]) @ builder.kf.T_wk[1])
+        sparse_map.add_key_frame(frame, T_wd[frame] @ se3.inverse(T_cd[kf]))
+    frame_points = FramePoints(corner(), KINECT, SENSOR)
+    assert Shape(sparse_map, frame_points, frame_points).join_pair(1, 0, T_cd)
+    e = se3.log(sparse_map.edge.T_ij[0] @ se3.inverse(sparse_map.kf.T_wk[0]) @ sparse_map.kf.T_wk[1])
     assert np.linalg.norm(e) < 0.006
 
 
-def revisit(frames: list[int], *, n: int = 60, pixel_noise: float = 2.0) -> MapBuilder:
+def revisit(frames: list[int], *, n: int = 60, pixel_noise: float = 2.0) -> SparseMap:
     """A map of true key frames at `frames` of the drive, that all see the same n landmarks, as bearings with coarse noise."""
     rng, T_wc = np.random.default_rng(5), turn(14)[frames]
     x_c = np.stack([rng.uniform(-0.3, 0.3, n), rng.uniform(-0.3, 0.3, n), rng.uniform(1.5, 3.0, n)], axis=1)
@@ -174,19 +176,19 @@ def revisit(frames: list[int], *, n: int = 60, pixel_noise: float = 2.0) -> MapB
         depth=np.full(rows, np.nan, "f4"), slope=np.zeros((rows, 2), "f4"), octave=np.zeros(rows, "u1"), angle=np.zeros(rows, "f4"),
         desc=np.tile(rng.integers(0, 256, (n, 32), dtype=np.uint8), (len(frames), 1)), octave_scale=np.array(1.2),
     )  # fmt: skip
-    builder = MapBuilder(features)
+    sparse_map = SparseMap(features)
     for k, T in enumerate(T_wc):
-        builder.add_key_frame(k, T)
-    ids = builder.add_landmarks(0, np.arange(n), xyz)
+        sparse_map.add_key_frame(k, T)
+    ids = sparse_map.add_landmarks(0, np.arange(n), xyz)
     for k in range(len(frames)):
-        builder.observe(k, ids, np.arange(k * n, (k + 1) * n))
-    return builder
+        sparse_map.observe(k, ids, np.arange(k * n, (k + 1) * n))
+    return sparse_map
 
 
 @pytest.mark.parametrize("most", [0, 1, 6])
 def test_a_second_look_joins_key_frames_that_see_the_same_and_moves_them_to_where_depth_shows_them(most):
     frames = [0, 2, 4, 6]
-    builder = revisit(frames)
+    sparse_map = revisit(frames)
     n = len(frames)
     tracks = Tracks(
         ref_kf=np.arange(n, dtype=np.int32),
@@ -194,26 +196,29 @@ def test_a_second_look_joins_key_frames_that_see_the_same_and_moves_them_to_wher
         state=np.full(n, KEY_FRAME, np.uint8),
         n_inliers=np.full(n, 60, np.int32),
     )
-    reliefs = Reliefs(CoarseDepth(corner().coarse_depth[frames]), KINECT, SENSOR)
+    frame_points = FramePoints(CoarseDepth(corner().coarse_depth[frames]), KINECT, SENSOR)
     sensing = Sensing(KINECT, Timing(np.array(0.0), np.array(0.0), np.array(0.0), np.zeros((n, 6))), {})
-    look = {"reliefs": reliefs, "iterations": 20, "progress": lambda items, *_: items}
-    after, result = final_refinement.look_again(builder, tracks, sensing, SENSOR, TrackConfig(), shape_edges=most, **look)
-    assert len(builder.edge) == {0: 0, 1: 3, 6: 6}[most]
+    look = {"frame_points": frame_points, "iterations": 20, "progress": lambda items, *_: items}
+    after, result = final_refinement.refine_all(sparse_map, tracks, sensing, SENSOR, TrackConfig(), depth_icp_edges=most, **look)
+    assert len(sparse_map.edge) == {0: 0, 1: 3, 6: 6}[most]
     assert (after.state == KEY_FRAME).all() and result.cost[-1] < result.cost[0]
     true = turn(14)[frames]
-    e = se3.log((se3.inverse(builder.kf.T_wk[0]) @ builder.kf.T_wk) @ se3.inverse(se3.inverse(true[0]) @ true))
+    e = se3.log((se3.inverse(sparse_map.kf.T_wk[0]) @ sparse_map.kf.T_wk) @ se3.inverse(se3.inverse(true[0]) @ true))
     error = np.linalg.norm(e[1:, :3], axis=1).mean()
     assert 1e-4 < error < 0.01 if most else error > 0.02
-    final_refinement.look_again(builder, after, sensing, SENSOR, TrackConfig(), shape_edges=most, **look)
-    assert len(builder.edge) == {0: 0, 1: 3, 6: 6}[most], "no pair is joined twice"
+    final_refinement.refine_all(sparse_map, after, sensing, SENSOR, TrackConfig(), depth_icp_edges=most, **look)
+    assert len(sparse_map.edge) == {0: 0, 1: 3, 6: 6}[most], "no pair is joined twice"
 
 
 def test_key_frames_are_joined_the_same_with_any_number_of_threads():
     frames, found = [0, 2, 4, 6], []
-    reliefs = Reliefs(CoarseDepth(corner().coarse_depth[frames]), KINECT, SENSOR)
+    frame_points = FramePoints(CoarseDepth(corner().coarse_depth[frames]), KINECT, SENSOR)
     for workers in (1, 3):
-        builder = revisit(frames)
-        assert Shape(builder, reliefs, reliefs).join_covisible(np.tile(np.eye(4), (4, 1, 1)), most=6, least=30, workers=workers) == 6
-        found.append(builder.edge)
+        sparse_map = revisit(frames)
+        assert (
+            Shape(sparse_map, frame_points, frame_points).join_covisible(np.tile(np.eye(4), (4, 1, 1)), most=6, least=30, workers=workers)
+            == 6
+        )
+        found.append(sparse_map.edge)
     for name in ("kf", "T_ij", "information"):
         np.testing.assert_array_equal(getattr(found[1], name), getattr(found[0], name))

@@ -13,7 +13,7 @@ from slamcli.slam import final_refinement, loop_closing
 from slamcli.slam.place_recognition import PlaceIndex
 from slamcli.slam.tracker import Tracker
 from slamcli.sparse_map import map_adjustment
-from slamcli.sparse_map.sparse_map import MapBuilder
+from slamcli.sparse_map.sparse_map import SparseMap
 
 SENSOR, SETTINGS = SensorConfig(pixel_noise=0.5), LoopConfig()
 
@@ -30,22 +30,22 @@ def turn():
     return scene, tracker.tracks(), tracker.map()
 
 
-def drifted(scene, map_, per_key_frame: np.ndarray) -> MapBuilder:
+def drifted(scene, map_, per_key_frame: np.ndarray) -> SparseMap:
     """Rebuild the map with an error that grows from key frame to key frame, landmarks and all."""
-    builder = MapBuilder.from_map(scene.features, map_)
-    T_wk = builder.kf.T_wk.copy()
+    sparse_map = SparseMap.from_map(scene.features, map_)
+    T_wk = sparse_map.kf.T_wk.copy()
     for k in range(1, len(T_wk)):
         step = se3.inverse(map_.T_wk[k - 1]) @ map_.T_wk[k] @ se3.exp(per_key_frame)
         T_wk[k] = T_wk[k - 1] @ step
-    loop_closing.apply(builder, T_wk)
-    return builder
+    loop_closing.apply(sparse_map, T_wk)
+    return sparse_map
 
 
-def verified(scene, builder) -> list[loop_closing.Candidate]:
-    places = PlaceIndex(scene.words, builder.kf.frame)
+def verified(scene, sparse_map) -> list[loop_closing.Candidate]:
+    places = PlaceIndex(scene.words, sparse_map.kf.frame)
     rng = np.random.default_rng(1)
-    candidates = loop_closing.find_candidates(builder, places, SETTINGS)
-    return [loop_closing.verify(builder, scene.words, c, CAMERA, SETTINGS, SENSOR, rng) for c in candidates]
+    candidates = loop_closing.find_candidates(sparse_map, places, SETTINGS)
+    return [loop_closing.verify(sparse_map, scene.words, c, CAMERA, SETTINGS, SENSOR, rng) for c in candidates]
 
 
 def test_similarity_is_symmetric_and_one_for_itself(turn):
@@ -58,9 +58,9 @@ def test_similarity_is_symmetric_and_one_for_itself(turn):
 
 def test_every_accepted_closure_is_true_and_the_revisit_is_found(turn):
     scene, _, map_ = turn
-    builder = drifted(scene, map_, np.array([0.002, 0.001, 0.0, 0.0, 0.0005, 0.0]))
-    accepted = [c for c in verified(scene, builder) if c.is_accepted]
-    assert any(c.kf_i > 0.9 * len(builder.kf) and c.kf_j < 0.15 * len(builder.kf) for c in accepted)
+    sparse_map = drifted(scene, map_, np.array([0.002, 0.001, 0.0, 0.0, 0.0005, 0.0]))
+    accepted = [c for c in verified(scene, sparse_map) if c.is_accepted]
+    assert any(c.kf_i > 0.9 * len(sparse_map.kf) and c.kf_j < 0.15 * len(sparse_map.kf) for c in accepted)
     true = scene.T_gc[map_.kf_frame]
     for c in accepted:
         error = se3.log(se3.inverse(se3.inverse(true[c.kf_i]) @ true[c.kf_j]) @ c.T_ij)
@@ -69,37 +69,37 @@ def test_every_accepted_closure_is_true_and_the_revisit_is_found(turn):
 
 def test_closing_takes_the_drift_out(turn):
     scene, _, map_ = turn
-    builder = drifted(scene, map_, np.array([0.003, 0.001, 0.0, 0.0, 0.001, 0.0]))
+    sparse_map = drifted(scene, map_, np.array([0.003, 0.001, 0.0, 0.0, 0.001, 0.0]))
     true = scene.T_gc[map_.kf_frame]
-    before = ape(builder.kf.T_wk, true)
-    accepted = [c for c in verified(scene, builder) if c.is_accepted]
-    graph = loop_closing.close(builder, accepted, SETTINGS)
-    loop_closing.apply(builder, graph.T_wk)
-    fused = sum(loop_closing.fuse_around(builder, c, CAMERA, SETTINGS, SENSOR) for c in accepted)
-    map_adjustment.adjust(builder, np.arange(len(builder.kf), dtype=np.int32), CAMERA, SENSOR, max_iterations=30)
-    after = ape(builder.kf.T_wk, true)
+    before = ape(sparse_map.kf.T_wk, true)
+    accepted = [c for c in verified(scene, sparse_map) if c.is_accepted]
+    graph = loop_closing.close(sparse_map, accepted, SETTINGS)
+    loop_closing.apply(sparse_map, graph.T_wk)
+    fused = sum(loop_closing.fuse_around(sparse_map, c, CAMERA, SETTINGS, SENSOR) for c in accepted)
+    map_adjustment.adjust(sparse_map, np.arange(len(sparse_map.kf), dtype=np.int32), CAMERA, SENSOR, max_iterations=30)
+    after = ape(sparse_map.kf.T_wk, true)
     assert fused > 50
     assert before > 0.02 and 1e-4 < after < before / 3
 
 
 def test_a_lone_true_closure_outlasts_a_drift_of_five_degrees(turn):
     scene, _, map_ = turn
-    builder = drifted(scene, map_, 4.0 * np.array([0.003, 0.001, 0.0, 0.0, 0.001, 0.0]))
-    far = [c for c in verified(scene, builder) if c.is_accepted and c.kf_i - c.kf_j > len(builder.kf) // 2][:1]
-    T_ij = se3.inverse(builder.kf.T_wk[far[0].kf_i]) @ builder.kf.T_wk[far[0].kf_j]
+    sparse_map = drifted(scene, map_, 4.0 * np.array([0.003, 0.001, 0.0, 0.0, 0.001, 0.0]))
+    far = [c for c in verified(scene, sparse_map) if c.is_accepted and c.kf_i - c.kf_j > len(sparse_map.kf) // 2][:1]
+    T_ij = se3.inverse(sparse_map.kf.T_wk[far[0].kf_i]) @ sparse_map.kf.T_wk[far[0].kf_j]
     assert 4.0 < np.degrees(np.linalg.norm(se3.log(T_ij @ se3.inverse(far[0].T_ij))[3:])) < 7.0
-    graph = loop_closing.close(builder, far, SETTINGS)
+    graph = loop_closing.close(sparse_map, far, SETTINGS)
     true = scene.T_gc[map_.kf_frame]
-    assert graph.is_kept.all() and ape(graph.T_wk, true) < 0.8 * ape(builder.kf.T_wk, true)
+    assert graph.is_kept.all() and ape(graph.T_wk, true) < 0.8 * ape(sparse_map.kf.T_wk, true)
 
 
 def test_a_planted_false_closure_is_dropped(turn):
     scene, _, map_ = turn
-    builder = MapBuilder.from_map(scene.features, map_)
-    accepted = [c for c in verified(scene, builder) if c.is_accepted]
-    n = len(builder.kf)
+    sparse_map = SparseMap.from_map(scene.features, map_)
+    accepted = [c for c in verified(scene, sparse_map) if c.is_accepted]
+    n = len(sparse_map.kf)
     false = loop_closing.Candidate(n // 2, 2, 0.4, 100, 200, T_ij=se3.exp(np.array([0.4, 0.1, 0.2, 0.0, 0.3, 0.0])))
-    honest, fooled = loop_closing.close(builder, accepted, SETTINGS), loop_closing.close(builder, [*accepted, false], SETTINGS)
+    honest, fooled = loop_closing.close(sparse_map, accepted, SETTINGS), loop_closing.close(sparse_map, [*accepted, false], SETTINGS)
     assert not fooled.is_kept[-1]
     true = scene.T_gc[map_.kf_frame]
     assert ape(fooled.T_wk, true) < 1.1 * ape(honest.T_wk, true)
@@ -107,10 +107,10 @@ def test_a_planted_false_closure_is_dropped(turn):
 
 def test_rejected_candidates_say_why(turn):
     scene, _, map_ = turn
-    builder = MapBuilder.from_map(scene.features, map_)
-    strangers = loop_closing.Candidate(len(builder.kf) // 2, 0, 0.9)
+    sparse_map = SparseMap.from_map(scene.features, map_)
+    strangers = loop_closing.Candidate(len(sparse_map.kf) // 2, 0, 0.9)
     rng = np.random.default_rng(2)
-    fate = loop_closing.verify(builder, scene.words, strangers, CAMERA, SETTINGS, SENSOR, rng)
+    fate = loop_closing.verify(sparse_map, scene.words, strangers, CAMERA, SETTINGS, SENSOR, rng)
     assert not fate.is_accepted and "of 20 matches" in fate.reason
 
 
@@ -118,8 +118,8 @@ def test_hindsight_finds_lost_frames_and_keeps_the_rest(turn):
     scene, tracks, map_ = turn
     tracks = replace(tracks, **{name: getattr(tracks, name).copy() for name in ("state", "ref_kf", "T_kc")})
     tracks.state[40:44], tracks.ref_kf[40:44], tracks.T_kc[40:44] = LOST, -1, np.nan
-    builder = MapBuilder.from_map(scene.features, map_)
-    after = final_refinement.refine_frames(builder, scene.features, tracks, CAMERA, SENSOR, TrackConfig(), lambda items, *_: items)
+    sparse_map = SparseMap.from_map(scene.features, map_)
+    after = final_refinement.refine_frames(sparse_map, scene.features, tracks, CAMERA, SENSOR, TrackConfig(), lambda items, *_: items)
     assert (after.state != LOST).all()
     error = [ape(frame_poses(t, map_), scene.T_gc) for t in (tracks, after)]
     assert 1e-4 < error[1] < error[0] + 0.001
@@ -129,8 +129,8 @@ def test_hindsight_finds_the_same_with_any_number_of_threads(turn):
     scene, tracks, map_ = turn
     found = []
     for workers in (1, 2, 4):
-        builder = MapBuilder.from_map(scene.features, map_)
-        look = (builder, scene.features, tracks, CAMERA, SENSOR, TrackConfig(), lambda items, *_: items)
+        sparse_map = SparseMap.from_map(scene.features, map_)
+        look = (sparse_map, scene.features, tracks, CAMERA, SENSOR, TrackConfig(), lambda items, *_: items)
         found.append(final_refinement.refine_frames(*look, workers=workers))
     assert (found[0].T_kc != tracks.T_kc).any()
     for other in found[1:]:
@@ -140,19 +140,19 @@ def test_hindsight_finds_the_same_with_any_number_of_threads(turn):
 
 def test_hindsight_matches_key_frames_again_and_the_world_stays_where_it_is(turn):
     scene, tracks, map_ = turn
-    builder = MapBuilder.from_map(scene.features, map_)
+    sparse_map = SparseMap.from_map(scene.features, map_)
     rng = np.random.default_rng(5)
-    noise = se3.exp(rng.normal(0, [0.01, 0.01, 0.01, 0.004, 0.004, 0.004], (len(builder.kf), 6)))
+    noise = se3.exp(rng.normal(0, [0.01, 0.01, 0.01, 0.004, 0.004, 0.004], (len(sparse_map.kf), 6)))
     noise[0] = np.eye(4)
-    builder.kf.T_wk[:] = builder.kf.T_wk @ noise
-    shaken = builder.kf.T_wk.copy()
-    found = final_refinement.refine_frames(builder, scene.features, tracks, CAMERA, SENSOR, TrackConfig(), lambda items, *_: items)
-    assert (builder.kf.T_wk == shaken).all(), "to refine frames leaves the map as it is"
-    seen, landmarks = frame_poses(found, builder.snapshot()), builder.snapshot().lm_xyz
-    after = final_refinement.move_key_frames(builder, found)
-    moved = builder.snapshot()
+    sparse_map.kf.T_wk[:] = sparse_map.kf.T_wk @ noise
+    shaken = sparse_map.kf.T_wk.copy()
+    found = final_refinement.refine_frames(sparse_map, scene.features, tracks, CAMERA, SENSOR, TrackConfig(), lambda items, *_: items)
+    assert (sparse_map.kf.T_wk == shaken).all(), "to refine frames leaves the map as it is"
+    seen, landmarks = frame_poses(found, sparse_map.snapshot()), sparse_map.snapshot().lm_xyz
+    after = final_refinement.move_key_frames(sparse_map, found)
+    moved = sparse_map.snapshot()
     assert (after.T_kc[moved.kf_frame] == np.eye(4)).all()
-    assert np.abs(builder.kf.T_wk[0] - shaken[0]).max() < 1e-12
+    assert np.abs(sparse_map.kf.T_wk[0] - shaken[0]).max() < 1e-12
     shift = shaken[0] @ se3.inverse(seen[moved.kf_frame[0]])
     assert np.nanmax(np.abs(frame_poses(after, moved) - shift @ seen)) < 1e-12
     assert np.abs(moved.lm_xyz - se3.transform(shift, landmarks)).max() < 1e-5
@@ -165,7 +165,7 @@ def test_a_key_frame_that_shape_held_keeps_its_pose(turn):
     most = int(tracks.n_inliers.max())
     found = [
         final_refinement.refine_frames(
-            MapBuilder.from_map(scene.features, map_), scene.features, tracks, CAMERA, SENSOR, replace(TrackConfig(), shape_below=least),
+            SparseMap.from_map(scene.features, map_), scene.features, tracks, CAMERA, SENSOR, replace(TrackConfig(), depth_icp_below=least),
             lambda items, *_: items,
         )
         for least in (10 * most, 0)
@@ -178,28 +178,28 @@ def test_a_key_frame_that_shape_held_keeps_its_pose(turn):
 def test_views_of_one_spot_are_found_by_their_poses(turn):
     scene, _, map_ = turn
     true = scene.T_gc[map_.kf_frame]
-    builder = drifted(scene, map_, np.array([0.001, 0.0, 0.0, 0.0, 0.0003, 0.0]))
-    places = PlaceIndex(scene.words, builder.kf.frame)
-    near = loop_closing.find_near(builder, places, SETTINGS)
-    spot = builder.kf.T_wk[:, :3, 3] + loop_closing.AHEAD * builder.kf.T_wk[:, :3, 2]
+    sparse_map = drifted(scene, map_, np.array([0.001, 0.0, 0.0, 0.0, 0.0003, 0.0]))
+    places = PlaceIndex(scene.words, sparse_map.kf.frame)
+    near = loop_closing.find_near(sparse_map, places, SETTINGS)
+    spot = sparse_map.kf.T_wk[:, :3, 3] + loop_closing.AHEAD * sparse_map.kf.T_wk[:, :3, 2]
     for c in near:
         assert c.is_near and c.kf_j < c.kf_i and np.linalg.norm(spot[c.kf_i] - spot[c.kf_j]) < SETTINGS.near
-        assert builder.votes(builder.landmarks_of(c.kf_i))[c.kf_j] < SETTINGS.min_shared
-    fate = [loop_closing.verify(builder, scene.words, c, CAMERA, SETTINGS, SENSOR, np.random.default_rng(0)) for c in near]
+        assert sparse_map.votes(sparse_map.landmarks_of(c.kf_i))[c.kf_j] < SETTINGS.min_shared
+    fate = [loop_closing.verify(sparse_map, scene.words, c, CAMERA, SETTINGS, SENSOR, np.random.default_rng(0)) for c in near]
     accepted = [c for c in fate if c.is_accepted]
     assert any(c.kf_i > 0.9 * len(true) and c.kf_j < 0.15 * len(true) for c in accepted)
     for c in accepted:
         error = se3.log(se3.inverse(se3.inverse(true[c.kf_i]) @ true[c.kf_j]) @ c.T_ij)
         assert np.linalg.norm(error[:3]) < 0.05 and np.linalg.norm(error[3:]) < 0.02
-    builder.kf.segment[len(true) // 2 :] = 1
+    sparse_map.kf.segment[len(true) // 2 :] = 1
     half = len(true) // 2
-    assert all((c.kf_i < half) == (c.kf_j < half) for c in loop_closing.find_near(builder, places, SETTINGS))
+    assert all((c.kf_i < half) == (c.kf_j < half) for c in loop_closing.find_near(sparse_map, places, SETTINGS))
 
 
 def test_no_spot_is_near_at_a_reach_of_zero(turn):
     scene, _, map_ = turn
-    builder = MapBuilder.from_map(scene.features, map_)
-    assert loop_closing.find_near(builder, PlaceIndex(scene.words, builder.kf.frame), LoopConfig(near=0.0)) == []
+    sparse_map = SparseMap.from_map(scene.features, map_)
+    assert loop_closing.find_near(sparse_map, PlaceIndex(scene.words, sparse_map.kf.frame), LoopConfig(near=0.0)) == []
 
 
 @pytest.mark.parametrize("span", [0, 3, 10])

@@ -7,7 +7,7 @@ from scenes import CAMERA, observe, room_points, sweep
 from slamcli.config.options import SensorConfig, TrackConfig
 from slamcli.slam.map_growth import MIN_FOUND, PROBATION, MapGrowth
 from slamcli.sparse_map.frame import frame_features
-from slamcli.sparse_map.sparse_map import MapBuilder
+from slamcli.sparse_map.sparse_map import SparseMap
 
 SENSOR = SensorConfig(pixel_noise=0.5)
 
@@ -23,20 +23,20 @@ def insert(growth: MapGrowth, scene, i: int, landmark: np.ndarray | None = None)
     return growth.insert(i, frame, scene.T_gc[i], np.full(len(frame), -1, np.int32) if landmark is None else landmark, 0)
 
 
-def on_probation(scene, n_key_frames: int = 1) -> tuple[MapBuilder, MapGrowth, np.ndarray]:
+def on_probation(scene, n_key_frames: int = 1) -> tuple[SparseMap, MapGrowth, np.ndarray]:
     """A first key frame whose landmarks are new, and some after it that see nothing of them."""
-    builder = MapBuilder(scene.features)
-    growth = MapGrowth(builder, CAMERA, TrackConfig(), SENSOR)
+    sparse_map = SparseMap(scene.features)
+    growth = MapGrowth(sparse_map, CAMERA, TrackConfig(), SENSOR)
     _, added = insert(growth, scene, 0)
     growth._on_probation = added
     for i in range(1, n_key_frames):
-        builder.add_key_frame(i, scene.T_gc[i])
-    return builder, growth, added
+        sparse_map.add_key_frame(i, scene.T_gc[i])
+    return sparse_map, growth, added
 
 
 def test_every_feature_with_depth_that_shows_no_landmark_becomes_one(scene):
-    builder = MapBuilder(scene.features)
-    growth = MapGrowth(builder, CAMERA, TrackConfig(), SENSOR)
+    sparse_map = SparseMap(scene.features)
+    growth = MapGrowth(sparse_map, CAMERA, TrackConfig(), SENSOR)
     n_depth = np.isfinite(frame_features(scene.features, 0, CAMERA, SENSOR).depth).sum()
     kf, added = insert(growth, scene, 0)
     assert (kf, len(added)) == (0, n_depth)
@@ -45,33 +45,33 @@ def test_every_feature_with_depth_that_shows_no_landmark_becomes_one(scene):
     landmark[:40] = added[:40]
     _, more = insert(growth, scene, 1, landmark)
     assert len(more) == np.isfinite(frame.depth[40:]).sum()
-    assert (builder.lm.n_obs[added[:40]] == 2).all() and (builder.lm.n_obs[added[40:]] == 1).all()
-    error = np.linalg.norm(builder.lm.xyz[added] - scene.xyz[scene.landmark[builder.obs.row[: len(added)]]], axis=1)
+    assert (sparse_map.lm.n_obs[added[:40]] == 2).all() and (sparse_map.lm.n_obs[added[40:]] == 1).all()
+    error = np.linalg.norm(sparse_map.lm.xyz[added] - scene.xyz[scene.landmark[sparse_map.obs.row[: len(added)]]], axis=1)
     assert 0 < np.median(error) < 0.05
 
 
 def test_what_frames_seldom_find_where_they_should_see_it_is_culled(scene):
-    builder, growth, added = on_probation(scene)
-    builder.lm.n_visible[added] = 20
-    builder.lm.n_found[added] = np.where(np.arange(len(added)) % 2, MIN_FOUND * 20, MIN_FOUND * 20 - 1)
+    sparse_map, growth, added = on_probation(scene)
+    sparse_map.lm.n_visible[added] = 20
+    sparse_map.lm.n_found[added] = np.where(np.arange(len(added)) % 2, MIN_FOUND * 20, MIN_FOUND * 20 - 1)
     growth.cull(0)
-    np.testing.assert_array_equal(builder.lm.is_alive[added], np.arange(len(added)) % 2 == 1)
+    np.testing.assert_array_equal(sparse_map.lm.is_alive[added], np.arange(len(added)) % 2 == 1)
 
 
 @pytest.mark.parametrize(("kf", "stays"), [(1, True), (2, False)])
 def test_what_no_second_key_frame_sees_goes_after_two(scene, kf: int, stays: bool):
-    builder, growth, added = on_probation(scene, kf + 1)
+    sparse_map, growth, added = on_probation(scene, kf + 1)
     growth.cull(kf)
-    assert builder.lm.is_alive[added].all() == stays and builder.lm.is_alive[added].any() == stays
+    assert sparse_map.lm.is_alive[added].all() == stays and sparse_map.lm.is_alive[added].any() == stays
 
 
 def test_what_was_confirmed_in_time_is_never_culled_again(scene):
-    builder, growth, added = on_probation(scene, PROBATION + 1)
+    sparse_map, growth, added = on_probation(scene, PROBATION + 1)
     frame = frame_features(scene.features, 1, CAMERA, SENSOR)
-    builder.observe(1, added[:50], frame.first_row + np.arange(50))
+    sparse_map.observe(1, added[:50], frame.first_row + np.arange(50))
     growth.cull(2)
-    np.testing.assert_array_equal(builder.lm.is_alive[added], np.arange(len(added)) < 50)
+    np.testing.assert_array_equal(sparse_map.lm.is_alive[added], np.arange(len(added)) < 50)
     growth.cull(PROBATION)  # its probation ends
-    builder.lm.n_visible[added[:50]] = 1000
+    sparse_map.lm.n_visible[added[:50]] = 1000
     growth.cull(PROBATION)
-    assert builder.lm.is_alive[added[:50]].all()
+    assert sparse_map.lm.is_alive[added[:50]].all()

@@ -11,11 +11,11 @@ from slamcli.config.options import TrackConfig
 from slamcli.errors import SlamError
 from slamcli.formats.trajectory import read_tum
 from slamcli.geometry import se3
-from slamcli.schema import LOST, RELOCALISED, Map, Tracks, frame_poses, frame_segments, trajectory
+from slamcli.schema import LOST, RELOCALIZED, Map, Tracks, frame_poses, frame_segments, trajectory
 from slamcli.slam import map_merging, map_segments
 from slamcli.slam.loop_closing import Candidate
 from slamcli.sparse_map import map_adjustment
-from slamcli.sparse_map.sparse_map import MapBuilder
+from slamcli.sparse_map.sparse_map import SparseMap
 from slamcli.stages import loop, optimize, track
 
 
@@ -134,12 +134,12 @@ def test_segments_that_saw_one_place_are_joined(tmp_path):
     np.testing.assert_allclose(np.array([v[2:5] for v in vertices], dtype=float), map_.T_wk[:, :3, 3], atol=1e-8)
 
 
-def test_a_place_known_from_an_earlier_segment_is_recognised(tmp_path):
+def test_a_place_known_from_an_earlier_segment_is_recognized(tmp_path):
     run = Run(scene_of((0.0, 0.3, 40), (0.6, 0.8, 40), (0.1, 0.3, 40)), tmp_path)
     run.stage(track)
     tracks, map_ = run.result("track")
     assert frame_segments(tracks, map_)[[0, 79, 80, 119]].tolist() == [0, 1, 0, 0]
-    assert tracks.state[80] in (RELOCALISED, 2) and run.summary["track"]["segments"] == 2
+    assert tracks.state[80] in (RELOCALIZED, 2) and run.summary["track"]["segments"] == 2
 
 
 def test_zero_never_begins_a_segment(tmp_path):
@@ -151,14 +151,14 @@ def test_zero_never_begins_a_segment(tmp_path):
     assert "frames 30 to 59 are lost: fewer than 15" in run.warnings[0]
 
 
-def two_segments(rng) -> tuple[MapBuilder, np.ndarray, np.ndarray]:
+def two_segments(rng) -> tuple[SparseMap, np.ndarray, np.ndarray]:
     """Six key frames of one world; the last three say they stand in another."""
     scene = scene_of((0.0, 0.2, 6))
-    builder = MapBuilder(scene.features)
+    sparse_map = SparseMap(scene.features)
     T_ab = se3.exp(rng.normal(0, 1, 6))
     for k, T in enumerate(scene.T_gc):
-        builder.add_key_frame(k, T if k < 3 else se3.inverse(T_ab) @ T, int(k >= 3))
-    return builder, scene.T_gc, T_ab
+        sparse_map.add_key_frame(k, T if k < 3 else se3.inverse(T_ab) @ T, int(k >= 3))
+    return sparse_map, scene.T_gc, T_ab
 
 
 def measured(T_gc, i, j, twist=None, n_inliers=90) -> Candidate:
@@ -167,31 +167,31 @@ def measured(T_gc, i, j, twist=None, n_inliers=90) -> Candidate:
 
 
 def test_closures_that_agree_join_and_the_one_that_does_not_is_left_out():
-    builder, T_gc, T_ab = two_segments(np.random.default_rng(1))
+    sparse_map, T_gc, T_ab = two_segments(np.random.default_rng(1))
     true = [measured(T_gc, 3, 1, [0.004, 0, 0, 0, 0.002, 0]), measured(T_gc, 4, 2), measured(T_gc, 5, 0)]
     false = measured(T_gc, 5, 2, [0.5, 0, 0.2, 0, 0.3, 0])
-    found = map_merging.find_join(builder, [*true, false], least=2)
+    found = map_merging.find_join(sparse_map, [*true, false], least=2)
     assert found.closures == true
     np.testing.assert_allclose(found.T_ab, T_ab, atol=0.02)
-    map_merging.join(builder, found)
-    assert (builder.kf.segment == 0).all()
-    np.testing.assert_allclose(builder.kf.T_wk, T_gc, atol=0.03)
+    map_merging.join(sparse_map, found)
+    assert (sparse_map.kf.segment == 0).all()
+    np.testing.assert_allclose(sparse_map.kf.T_wk, T_gc, atol=0.03)
 
 
 def test_one_closure_alone_joins_nothing():
-    builder, T_gc, _ = two_segments(np.random.default_rng(2))
-    assert map_merging.find_join(builder, [measured(T_gc, 3, 1)], least=2) is None
-    assert map_merging.find_join(builder, [measured(T_gc, 3, 1)], least=1) is not None
+    sparse_map, T_gc, _ = two_segments(np.random.default_rng(2))
+    assert map_merging.find_join(sparse_map, [measured(T_gc, 3, 1)], least=2) is None
+    assert map_merging.find_join(sparse_map, [measured(T_gc, 3, 1)], least=1) is not None
 
 
 @pytest.mark.parametrize(("n_inliers", "is_joined"), [(60, False), (30, True)])
 def test_what_looks_alike_in_two_places_joins_nothing(n_inliers, is_joined):
-    builder, T_gc, _ = two_segments(np.random.default_rng(3))
+    sparse_map, T_gc, _ = two_segments(np.random.default_rng(3))
     true = [measured(T_gc, 3, 1), measured(T_gc, 4, 1)]
     next_door = se3.exp(np.array([2.0, 0, 0, 0, 0, 0]))
     alike = [measured(T_gc, i, 0, n_inliers=n_inliers) for i in (4, 5)]
     alike = [replace(c, T_ij=se3.inverse(T_gc[c.kf_i]) @ next_door @ T_gc[c.kf_j]) for c in alike]
-    found = map_merging.find_join(builder, [*true, *alike], least=2)
+    found = map_merging.find_join(sparse_map, [*true, *alike], least=2)
     assert (found is not None) == is_joined
 
 
@@ -210,7 +210,7 @@ def test_segments_are_numbered_by_their_frames():
 
 def test_each_segment_has_its_gauge_fixed(apart):
     _, map_ = apart.result("track")
-    builder = MapBuilder.from_map(apart.scene.features, map_)
-    part = map_adjustment.gather(builder, np.arange(len(builder.kf), dtype=np.int32), SENSOR)
+    sparse_map = SparseMap.from_map(apart.scene.features, map_)
+    part = map_adjustment.gather(sparse_map, np.arange(len(sparse_map.kf), dtype=np.int32), SENSOR)
     first = [int(np.flatnonzero(map_.kf_segment == s)[0]) for s in (0, 1)]
     np.testing.assert_array_equal(np.flatnonzero(part.is_fixed), first)

@@ -80,7 +80,7 @@ def test_optical_flow_carries_over_a_jerk_that_descriptors_and_the_motion_model_
     flowed = optical_flow.match(xy, went, is_free_i=is_free, is_free_j=is_free, radius=2.0)
     states = {}
     for name, rows in (("flow", flowed), ("no match", np.empty((0, 2), dtype=np.int32))):
-        tracker = track(replace(scene, matches=with_rows(scene.matches, jerk, rows)), segment_after=0, relocalise_inliers=1000)
+        tracker = track(replace(scene, matches=with_rows(scene.matches, jerk, rows)), segment_after=0, relocalize_inliers=1000)
         states[name] = tracker.tracks().state
         lost = np.flatnonzero(states[name] == LOST)
         assert name == "no match" or 1e-5 < ape(frame_poses(tracker.tracks(), tracker.map()), T_gc) < 0.005
@@ -89,7 +89,7 @@ def test_optical_flow_carries_over_a_jerk_that_descriptors_and_the_motion_model_
 
 
 def with_rows(matches: Matches, frame: int, rows: np.ndarray) -> Matches:
-    """Give frame `frame` these matches with the one before, instead of its own."""
+    """Return frame `frame` these matches with the one before, instead of its own."""
     parts = [
         rows if i == frame else matches.row[a:b] for (i, _), a, b in zip(matches.pair, matches.offset, matches.offset[1:], strict=False)
     ]

@@ -1,4 +1,4 @@
-"""The tree of words: training, quantising, word vectors, index, files."""
+"""The tree of words: training, quantizing, word vectors, index, files."""
 
 import io
 import zipfile
@@ -42,7 +42,7 @@ def test_training_recovers_well_separated_groups() -> None:
     assert trained.n_words == 8
     nearest = [min(distance(c, w) for w in trained.centre[1:]) for c in centre]
     assert max(nearest) <= 3, "a majority of 50 votes with 5 % noise is all but exact"
-    word = vocabulary.quantise(trained, desc)[0].reshape(8, 50)
+    word = vocabulary.quantize(trained, desc)[0].reshape(8, 50)
     assert (word == word[:, :1]).all() and len(np.unique(word)) == 8
 
 
@@ -124,9 +124,9 @@ def test_the_tree_is_well_formed(small: Vocabulary) -> None:
     assert (small.parent < np.arange(1, len(small.centre))).all()
 
 
-def test_quantising_goes_down_as_its_twin(small: Vocabulary) -> None:
+def test_quantizing_goes_down_as_its_twin(small: Vocabulary) -> None:
     desc = np.random.default_rng(9).integers(0, 256, (60, 32)).astype(np.uint8)
-    word, node = vocabulary.quantise(small, desc, node_level=1, margin=10)
+    word, node = vocabulary.quantize(small, desc, node_level=1, margin=10)
     children = {v: list(range(small.first_child[v], small.first_child[v + 1])) for v in range(len(small.centre))}
     expected = [naive.word_of(children, small.centre, d) for d in desc]
     np.testing.assert_array_equal(word, small.word_of_node[expected])
@@ -139,7 +139,7 @@ def test_quantising_goes_down_as_its_twin(small: Vocabulary) -> None:
 @pytest.mark.parametrize("node_level", [0, 1, 2, 3, 9])
 def test_the_node_is_the_words_ancestor(small: Vocabulary, node_level: int) -> None:
     desc = np.random.default_rng(5).integers(0, 256, (40, 32)).astype(np.uint8)
-    word, node = vocabulary.quantise(small, desc, node_level=node_level)
+    word, node = vocabulary.quantize(small, desc, node_level=node_level)
     leaf = np.flatnonzero(small.word_of_node >= 0)[word]
     assert (node[:, 1] == -1).all()
     for v, ancestor in zip(leaf, node[:, 0], strict=True):
@@ -150,7 +150,7 @@ def test_the_node_is_the_words_ancestor(small: Vocabulary, node_level: int) -> N
 
 
 def test_no_descriptor_has_no_word(small: Vocabulary) -> None:
-    word, node = vocabulary.quantise(small, np.zeros((0, 32), np.uint8))
+    word, node = vocabulary.quantize(small, np.zeros((0, 32), np.uint8))
     assert word.shape == (0,) and node.shape == (0, 2)
 
 
@@ -249,7 +249,7 @@ def test_children_of_any_tree_are_put_side_by_side(small: Vocabulary) -> None:
     weight = np.concatenate([[0], small.node_weight])[order][1:]
     rebuilt = vocabulary.from_parents(parent, small.centre[order][1:], weight, origin="", source="test")
     desc = groups(np.random.default_rng(4), 60, 20, 0.08)[1]
-    centre = [v.centre[v.word_of_node >= 0][vocabulary.quantise(v, desc)[0]] for v in (small, rebuilt)]
+    centre = [v.centre[v.word_of_node >= 0][vocabulary.quantize(v, desc)[0]] for v in (small, rebuilt)]
     assert np.mean((centre[0] == centre[1]).all(axis=1)) > 0.9  # ties may go the other way
     np.testing.assert_allclose(np.sort(rebuilt.idf), np.sort(small.idf))
 

@@ -61,5 +61,5 @@ READERS = (
 
 
 def reader_of(path: Path) -> Reader | None:
-    """Give the reader that recognises a path."""
+    """Return the reader that recognises a path."""
     return next((reader for reader in READERS if reader.layout.recognises(path)), None)

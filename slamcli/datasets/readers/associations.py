@@ -28,7 +28,7 @@ def read(path: Path) -> Recorded:
 
 
 def of_pairs(pairs: PairList, path: Path, *, reader: str, truth: Truth | None, depth_scale: float | None = None) -> Recorded:
-    """Give what a list of pairs says."""
+    """Return what a list of pairs says."""
     return Recorded(
         reader=reader,
         root=path,
@@ -43,7 +43,7 @@ def of_pairs(pairs: PairList, path: Path, *, reader: str, truth: Truth | None, d
 
 
 def association_file(path: Path) -> Path | None:
-    """Give the file that pairs the images; one of another name where it is the only text file that says so."""
+    """Return the file that pairs the images; one of another name where it is the only text file that says so."""
     for name in NAMES:
         if (path / name).is_file():
             return path / name

@@ -38,7 +38,7 @@ def read(path: Path) -> Recorded:
 
 
 def _poses(path: Path, numbers: list[int | None]) -> np.ndarray:
-    """Give each image the pose of its number, (N, 4, 4); number 0 has none."""
+    """Return each image the pose of its number, (N, 4, 4); number 0 has none."""
     truth = read_tum(_truth_file(path) or path)
     of = {round(float(stamp)): T_wc for stamp, T_wc in zip(truth.stamp, truth.T_wc, strict=True)}
     unknown = np.full((4, 4), np.nan)

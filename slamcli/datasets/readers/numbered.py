@@ -50,7 +50,7 @@ def of_folders(
     depth: str | None = None,
     depth_scale: float | None = None,
 ) -> Recorded:
-    """Give the images of two folders, found by their usual names where not given, by number."""
+    """Return the images of two folders, found by their usual names where not given, by number."""
     colour, depth = colour or subfolder(path, COLOUR_FOLDERS), depth or subfolder(path, DEPTH_FOLDERS)
     folder = Folder(path)
     stamped = _stamped(path, folder, colour or "", depth or "", reader, calibration, depth_scale)

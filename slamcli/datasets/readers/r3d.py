@@ -63,7 +63,7 @@ class Members:
         return f"{self.path}:{self.names[i]}"
 
     def n_bytes(self, i: int) -> int:
-        """Give the member's size."""
+        """Return the member's size."""
         try:
             return self.archive.getinfo(self.names[i]).file_size
         except KeyError:

@@ -54,7 +54,7 @@ def intrinsics(about: dict[str, Any], source: Path) -> Calibration:
 
 
 def stamps(about: dict[str, Any], numbers: list[int]) -> np.ndarray | None:
-    """Give the stamp of each number; from the frame rate where there is no list, None where there is neither."""
+    """Return the stamp of each number; from the frame rate where there is no list, None where there is neither."""
     listed, fps = about.get("frameTimestamps"), about.get("fps")
     try:
         if isinstance(listed, list) and listed:

@@ -65,7 +65,7 @@ def of_bag(bag: Bag, path: Path, *, reader: str) -> Recorded:
 
 
 def intrinsics(info: CameraInfo) -> dict:
-    """Give a CameraInfo as keys of Camera."""
+    """Return a CameraInfo as keys of Camera."""
     k = info.k
     size = {"width": info.width, "height": info.height} if info.width and info.height else {}
     return {**size, "fx": k[0], "fy": k[4], "cx": k[2], "cy": k[5], **distortion(info.d, info.model)}
@@ -150,7 +150,7 @@ def _pose(bag: Bag, frame: str, depth_frame: str) -> np.ndarray | None:
 
 
 def _chain(up: dict[str, tuple[str, np.ndarray]], frame: str) -> dict[str, np.ndarray]:
-    """Give the transform from a frame to each of those above it."""
+    """Return the transform from a frame to each of those above it."""
     chain = {frame: np.eye(4)}
     while frame in up and up[frame][0] not in chain:
         parent, T = up[frame]

@@ -44,7 +44,7 @@ def _calibration(folder: Path) -> Calibration:
 
 
 def of_two(colour: dict, depth: dict, T_bc: np.ndarray, T_bd: np.ndarray, source: str) -> Calibration:
-    """Give the calibration of both cameras, each with its pose on the body; equal ones mean that depth is registered."""
+    """Return the calibration of both cameras, each with its pose on the body; equal ones mean that depth is registered."""
     T_cd = np.linalg.inv(T_bc) @ T_bd
     keys = ("fx", "fy", "cx", "cy")
     is_same = all(abs(colour[key] - depth[key]) < 1e-6 for key in keys) and np.allclose(T_cd, np.eye(4), atol=1e-9)

@@ -116,7 +116,7 @@ class SensColour:
         return f"{self._file.path}:{self.names[i]}"
 
     def n_bytes(self, i: int) -> int:
-        """Give the size as stored."""
+        """Return the size as stored."""
         return self._places[i][1]
 
     def read(self, i: int) -> Picture | np.ndarray:

@@ -94,7 +94,7 @@ def _intrinsics(about: dict[str, Any], frames: list[dict[str, Any]]) -> dict[str
 
 
 def _depth_scale(about: dict[str, Any]) -> float:
-    """Give units per metre: nerfstudio's default is millimetres; NeRFCapture says by how much whole numbers were divided."""
+    """Return units per metre: nerfstudio's default is millimetres; NeRFCapture says by how much whole numbers were divided."""
     for key in ("depth_unit_scale_factor", "integer_depth_scale"):
         value = about.get(key)
         if isinstance(value, (int, float)) and not isinstance(value, bool) and value > 0:

@@ -29,25 +29,25 @@ FONTS = (cv2.FONT_HERSHEY_SIMPLEX, cv2.FONT_HERSHEY_DUPLEX, cv2.FONT_HERSHEY_COM
 
 
 def vector(colour: Colour) -> np.ndarray:
-    """Give a colour as (3,) float32."""
+    """Return a colour as (3,) float32."""
     return np.array(colour, dtype=np.float32)
 
 
 def canvas(width: float, height: float, scale: float, colour: Colour) -> np.ndarray:
-    """Give a picture of one colour, float32 while it is being painted."""
+    """Return a picture of one colour, float32 while it is being painted."""
     shape = max(2, round(height * scale)), max(2, round(width * scale))
     return np.broadcast_to(vector(colour), (*shape, 3)).copy()
 
 
 def smooth_noise(rng: np.random.Generator, shape: tuple[int, int], cells: tuple[float, float]) -> np.ndarray:
-    """Give noise in about -1..1 that varies over `cells` (rows, columns) [px]."""
+    """Return noise in about -1..1 that varies over `cells` (rows, columns) [px]."""
     grid = [max(2, int(np.ceil(n / max(cell, 1.0))) + 1) for n, cell in zip(shape, cells, strict=True)]
     coarse = rng.uniform(-1.0, 1.0, grid).astype(np.float32)
     return cv2.resize(coarse, (shape[1], shape[0]), interpolation=cv2.INTER_CUBIC)
 
 
 def cloudy(rng: np.random.Generator, shape: tuple[int, int], cell: float, octaves: int = 4) -> np.ndarray:
-    """Give fractal noise in about -1..1 whose largest blots measure `cell` px."""
+    """Return fractal noise in about -1..1 whose largest blots measure `cell` px."""
     layers = [0.5**k * smooth_noise(rng, shape, (cell * 0.5**k, cell * 0.5**k)) for k in range(octaves)]
     return np.array(layers).sum(axis=0) / np.float32(1.6)
 
@@ -63,7 +63,7 @@ def pick(rng: np.random.Generator, options: tuple) -> Any:
 
 
 def tint(colour: Colour, factor: float = 1.0, shift: float = 0.0, spread: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Colour:
-    """Give a colour made darker or lighter, kept within 0..255."""
+    """Return a colour made darker or lighter, kept within 0..255."""
     r, g, b = (min(255.0, max(0.0, factor * c + shift + d)) for c, d in zip(colour, spread, strict=True))
     return r, g, b
 

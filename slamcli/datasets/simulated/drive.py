@@ -22,7 +22,7 @@ class Motion:
 
 
 def closed_path(low: np.ndarray, high: np.ndarray, margin: float, rng: np.random.Generator) -> np.ndarray:
-    """Give a smooth closed path (DENSE, 2), `margin` from the walls: a superellipse with slight waves, counter-clockwise."""
+    """Return a smooth closed path (DENSE, 2), `margin` from the walls: a superellipse with slight waves, counter-clockwise."""
     half = (high[:2] - low[:2]) / 2 - margin
     angle = np.linspace(0.0, 2 * np.pi, DENSE, endpoint=False) + rng.uniform(0, 2 * np.pi)
     wave = np.sum([rng.uniform(-0.02, 0.02) * np.cos(k * angle + rng.uniform(0, 2 * np.pi)) for k in (2, 3, 5)], axis=0)
@@ -65,13 +65,13 @@ def rounds(
 
 
 def _sway(share: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Give smooth values of about -1..1 that differ from lap to lap."""
+    """Return smooth values of about -1..1 that differ from lap to lap."""
     waves = [rng.normal() * np.sin(2 * np.pi * (f * share + rng.random())) / 2 for f in (1.7, 4.3, 11.1)]
     return np.sum(waves, axis=0)
 
 
 def look_along(position: np.ndarray, heading: np.ndarray, pitch: np.ndarray | float, roll: np.ndarray | float) -> np.ndarray:
-    """Give T_lc (N, 4, 4) of cameras at (N, 3) that look along a heading [rad], pitched up and rolled clockwise."""
+    """Return T_lc (N, 4, 4) of cameras at (N, 3) that look along a heading [rad], pitched up and rolled clockwise."""
     heading, pitch, roll = np.broadcast_arrays(heading, pitch, roll)
     forward = np.stack([np.cos(heading) * np.cos(pitch), np.sin(heading) * np.cos(pitch), np.sin(pitch)], axis=1)
     right = np.stack([np.sin(heading), -np.cos(heading), np.zeros(len(heading))], axis=1)
@@ -102,7 +102,7 @@ def along(trajectory: Trajectory, stamps: np.ndarray | None, *, rate: float, fra
 
 
 def interpolate(trajectory: Trajectory, stamp: np.ndarray) -> np.ndarray:
-    """Give the poses (N, 4, 4) at stamps within the trajectory."""
+    """Return the poses (N, 4, 4) at stamps within the trajectory."""
     if len(trajectory.stamp) == 1:
         return np.tile(trajectory.T_wc[0], (len(stamp), 1, 1))
     after = np.searchsorted(trajectory.stamp, stamp).clip(1, len(trajectory.stamp) - 1)
@@ -128,7 +128,7 @@ def _smooth_closed(values: np.ndarray, share: float) -> np.ndarray:
 
 
 def _at(path: np.ndarray, share: np.ndarray) -> np.ndarray:
-    """Give the points (N, 2) at shares of the closed path's length."""
+    """Return the points (N, 2) at shares of the closed path's length."""
     grid = np.arange(DENSE + 1) / DENSE
     return np.stack([np.interp(share % 1.0, grid, np.append(path[:, k], path[0, k])) for k in range(2)], axis=1)
 

@@ -167,7 +167,7 @@ def _meet(kind, ox, oy, oz, dx, dy, dz):
 
 @kernel
 def _unwrap(kind, x, y, z):
-    """Give the gradient of the unit sphere or cube at a point of it, and where in its picture that point is (shares of width and height)."""
+    """Return the gradient of the unit sphere or cube at a point of it, and where in its picture that point is (shares of width and height)."""
     if kind == 0:
         return x, y, z, 0.5 + np.arctan2(y, x) / (2 * np.pi), 0.5 - 0.5 * z
     ax, ay, az = abs(x), abs(y), abs(z)

@@ -111,7 +111,7 @@ def limbs(posture: Posture, size: float) -> np.ndarray:
 
 
 def standing_at(xy: np.ndarray, heading: np.ndarray) -> np.ndarray:
-    """Give T (N, 4, 4) from frames on the floor at `xy` (N, 2), their x axes along `heading` (N,), to the level frame."""
+    """Return T (N, 4, 4) from frames on the floor at `xy` (N, 2), their x axes along `heading` (N,), to the level frame."""
     T = np.tile(np.eye(4), (len(heading), 1, 1))
     c, s = np.cos(heading), np.sin(heading)
     T[:, 0, 0], T[:, 0, 1], T[:, 1, 0], T[:, 1, 1], T[:, :2, 3] = c, -s, s, c, xy
@@ -119,11 +119,11 @@ def standing_at(xy: np.ndarray, heading: np.ndarray) -> np.ndarray:
 
 
 def _along(angle: np.ndarray) -> np.ndarray:
-    """Give the direction (N, 3) of a limb that hangs down, swung forward by an angle (N,)."""
+    """Return the direction (N, 3) of a limb that hangs down, swung forward by an angle (N,)."""
     return np.stack([np.sin(angle), np.zeros_like(angle), -np.cos(angle)], axis=1)
 
 
 def _turn(pitch: np.ndarray) -> np.ndarray:
-    """Give rotations (N, 3, 3) about the axis to the left, a positive angle bowing forward."""
+    """Return rotations (N, 3, 3) about the axis to the left, a positive angle bowing forward."""
     c, s, zero, one = np.cos(pitch), np.sin(pitch), np.zeros_like(pitch), np.ones_like(pitch)
     return np.stack([c, zero, s, zero, one, zero, -s, zero, c], axis=1).reshape(-1, 3, 3)

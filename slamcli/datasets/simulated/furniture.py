@@ -32,7 +32,7 @@ class Piece:
     solids: list[Solid]
 
     def at(self, x: float, y: float, yaw: float) -> list[Solid]:
-        """Give its solids with the middle of the back at (x, y), turned by `yaw` [rad]."""
+        """Return its solids with the middle of the back at (x, y), turned by `yaw` [rad]."""
         c, s = np.cos(yaw), np.sin(yaw)
         R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
         return [replace(solid, centre=R @ solid.centre + [x, y, 0.0], yaw=solid.yaw + yaw) for solid in self.solids]

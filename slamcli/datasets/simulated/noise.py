@@ -34,7 +34,7 @@ class NormalNoise:
         self._large = np.random.default_rng([seed, 4]).standard_normal([n + self.MARGIN for n in shape], dtype=np.float32)
 
     def cut(self, rng: np.random.Generator) -> np.ndarray:
-        """Give (H, W) float32, mean 0, variance 1."""
+        """Return (H, W) float32, mean 0, variance 1."""
         row, column = rng.integers(0, self.MARGIN, 2)
         return self._large[row : row + self._shape[0], column : column + self._shape[1]]
 
@@ -42,7 +42,7 @@ class NormalNoise:
 def depth_noise(
     depth: np.ndarray, cosine: np.ndarray, focal: float, noise: SensorNoise, normal_noise: NormalNoise, rng: np.random.Generator
 ) -> np.ndarray:
-    """Give noisy depth (H, W) float32 [m], 0 where there is no reading.
+    """Return noisy depth (H, W) float32 [m], 0 where there is no reading.
 
     depth : (H, W) float32 [m], exact
     cosine : (H, W) float32, of the angle between ray and surface normal

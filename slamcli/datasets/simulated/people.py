@@ -82,7 +82,7 @@ def _person(name: str, activity: str, course: Course, rng: np.random.Generator) 
 
 
 def _carried(posture: Callable[[np.ndarray], Posture], t: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-    """Give the pose of a box that stands on the floor before a person's feet until it is picked up, then goes along."""
+    """Return the pose of a box that stands on the floor before a person's feet until it is picked up, then goes along."""
     start = posture(t[:1])
 
     def pose(stamp: np.ndarray) -> np.ndarray:
@@ -146,7 +146,7 @@ def _upright(course: Course) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _place(course: Course, distance: np.ndarray | float, aside: np.ndarray | float, t: np.ndarray | None = None) -> np.ndarray:
-    """Give places (N, 2) ahead of the camera and to the left of its way."""
+    """Return places (N, 2) ahead of the camera and to the left of its way."""
     t = course.t if t is None else t
     here, beyond = course.ahead(t, distance), course.ahead(t, np.asarray(distance) + 0.1)
     along = beyond - here
@@ -156,7 +156,7 @@ def _place(course: Course, distance: np.ndarray | float, aside: np.ndarray | flo
 
 
 def _wait_and_go(course: Course, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Give places (T, 2) of waiting and of walking on in turn, and whether one waits (T,); nobody waits until the camera bumps into them."""
+    """Return places (T, 2) of waiting and of walking on in turn, and whether one waits (T,); nobody waits until the camera bumps into them."""
     distance, aside = rng.uniform(1.9, 2.5), rng.uniform(-0.35, 0.35)
     goal, camera = _place(course, distance, aside), course.ahead(course.t, 0.0)
     xy, waits = np.empty_like(goal), np.ones(len(course.t), dtype=bool)
@@ -206,7 +206,7 @@ def _in_view(motion: Motion) -> Ahead:
 
 
 def _last_direction(step: np.ndarray, speed: np.ndarray) -> np.ndarray:
-    """Give the direction (N, 2) of each step, of a rest that of the step before it."""
+    """Return the direction (N, 2) of each step, of a rest that of the step before it."""
     moves = speed > 0.05
     first = int(np.argmax(moves)) if moves.any() else 0
     index = np.maximum.accumulate(np.where(moves, np.arange(len(speed)), first))

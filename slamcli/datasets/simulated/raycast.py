@@ -37,7 +37,7 @@ class Renderer:
         self._rays = camera.rays.astype(np.float64).reshape(-1, 2)
 
     def render(self, T_lc: np.ndarray, *, with_movable: bool = True) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Give colour (H, W, 3) float32, depth (H, W) float32 [m] and the cosine of incidence (H, W) float32."""
+        """Return colour (H, W, 3) float32, depth (H, W) float32 [m] and the cosine of incidence (H, W) float32."""
         shape = (self._camera.height, self._camera.width)
         seen = self._see_all(T_lc, with_movable)
         rgb, depth, cosine = self._shade(T_lc, self._rays, seen)
@@ -49,14 +49,14 @@ class Renderer:
         return rgb.reshape(*shape, 3), depth.reshape(shape), cosine.reshape(shape)
 
     def depth(self, T_lc: np.ndarray, *, with_movable: bool = True) -> tuple[np.ndarray, np.ndarray]:
-        """Give depth and cosine of incidence alone."""
+        """Return depth and cosine of incidence alone."""
         shape = (self._camera.height, self._camera.width)
         seen = self._see_all(T_lc, with_movable)
         depth, cosine = _depth_kernel(self._rays, seen, self._atlas.plane @ T_lc)
         return depth.reshape(shape), cosine.reshape(shape)
 
     def _see_all(self, T_lc: np.ndarray, with_movable: bool) -> np.ndarray:
-        """Give the patch that each pixel sees, (H W,) int32.
+        """Return the patch that each pixel sees, (H W,) int32.
 
         Where the focal length is long enough for furniture to be wider than two pixels, every second pixel of every second row is cast
         first, and those in between only where their neighbours disagree: 2.5 times faster.
@@ -71,7 +71,7 @@ class Renderer:
         return seen
 
     def _see(self, T_lc: np.ndarray, rays: np.ndarray, with_movable: bool) -> np.ndarray:
-        """Give the patch (N,) int32 that each camera ray (x/z, y/z) hits; the room is closed, so there is one."""
+        """Return the patch (N,) int32 that each camera ray (x/z, y/z) hits; the room is closed, so there is one."""
         o3d = load_open3d()
         scene, patch_of = (self._scene, self._patch_of) if with_movable else (self._fixed_scene, self._fixed_patch_of)
         hit = scene.cast_rays(o3d.core.Tensor.from_numpy(_pack_kernel(rays, T_lc)), nthreads=1)["primitive_ids"].numpy()

@@ -88,7 +88,7 @@ class FreeSpace:
         self._taken.append(rect)
 
     def distance_to_path(self, rect: tuple[np.ndarray, np.ndarray], top: float) -> float:
-        """Give the plan distance [m] from a rectangle to the part of the path that passes below `top` + clearance."""
+        """Return the plan distance [m] from a rectangle to the part of the path that passes below `top` + clearance."""
         below = self._path[self._path[:, 2] < top + CLEARANCE][:, :2]
         if len(below) == 0:
             return np.inf
@@ -113,7 +113,7 @@ def _lamps(low: np.ndarray, high: np.ndarray) -> np.ndarray:
 
 
 def _rugs(low: np.ndarray, high: np.ndarray, rng: np.random.Generator) -> tuple[tuple[float, float, float, float], ...]:
-    """Give rugs (x, y, width, height) in the floor picture's metres."""
+    """Return rugs (x, y, width, height) in the floor picture's metres."""
     size = high[:2] - low[:2]
     rugs = []
     for _ in range(max(1, int(size[0] * size[1] / 14))):
@@ -125,7 +125,7 @@ def _rugs(low: np.ndarray, high: np.ndarray, rng: np.random.Generator) -> tuple[
 def _paint_walls(
     low: np.ndarray, high: np.ndarray, rng: np.random.Generator, twins: bool
 ) -> tuple[dict[str, Painter], list[tuple[np.ndarray, np.ndarray]]]:
-    """Give the walls' painters, and the floor before doors, which stays free."""
+    """Return the walls' painters, and the floor before doors, which stays free."""
     bases = [t.brick((182, 98, 78)), t.stripes(((222, 214, 196), (206, 196, 174), (150, 128, 110)), 0.3)]
     bases += [t.plaster(pick(rng, WALL_COLOURS)) for _ in range(2)]
     order = rng.permutation(4)
@@ -172,7 +172,7 @@ def _wall_items(length: float, height: float, rng: np.random.Generator, taken: l
 
 
 def _rect(x: float, y: float, yaw: float, piece: Piece) -> tuple[np.ndarray, np.ndarray]:
-    """Give the footprint of a piece that stands parallel to the walls."""
+    """Return the footprint of a piece that stands parallel to the walls."""
     c, s = np.cos(yaw), np.sin(yaw)
     local = np.array([[-piece.width / 2, 0.0], [piece.width / 2, -piece.depth]])
     corners = local @ np.array([[c, s], [-s, c]]) + [x, y]

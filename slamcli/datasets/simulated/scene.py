@@ -46,14 +46,14 @@ class Solid:
     is_movable: bool = False
 
     def to_dict(self) -> dict[str, Any]:
-        """Give the entry of scene.json."""
+        """Return the entry of scene.json."""
         shape: dict[str, Any] = {"size": _rounded(self.size), "yaw": round(float(self.yaw), 9)}
         if self.kind == "cylinder":
             shape = {"radius": round(float(self.size[0] / 2), 9), "height": round(float(self.size[2]), 9)}
         return {"name": self.name, "type": self.kind, "centre": _rounded(self.centre), **shape}
 
     def patches(self) -> list[Patch]:
-        """Give its faces; a bottom that stands on the floor is left out."""
+        """Return its faces; a bottom that stands on the floor is left out."""
         return self._box() if self.kind == "box" else self._cylinder()
 
     def _painter(self, side: str) -> Painter:
@@ -107,11 +107,11 @@ class Scene:
     seed: int
 
     def patches(self) -> list[Patch]:
-        """Give every patch, the room's own first."""
+        """Return every patch, the room's own first."""
         return self.shell + [patch for solid in self.solids for patch in solid.patches()]
 
     def to_dict(self) -> dict[str, Any]:
-        """Give the room's part of scene.json."""
+        """Return the room's part of scene.json."""
         return {
             "room": {"min": _rounded(self.low), "max": _rounded(self.high)},
             "obstacles": [solid.to_dict() for solid in self.solids],
