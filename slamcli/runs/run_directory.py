@@ -137,6 +137,8 @@ class RunDir:
         """Write ``run.json`` and ``config.toml`` anew where they are damaged, from what the finished stages recorded."""
         is_run = _has_stage(self.path) or ((self.path / ".lock").is_file() and (self.path / "run.json").exists())
         lacking = [name for name in ("run.json", "config.toml") if is_run and not self._is_sealed(name)]
+        if "run.json" not in lacking and lacking:
+            self._checked()  # a run of another version is not damaged: it is refused, and stays as it is
         if not lacking:
             return
         with self.lock():

@@ -1,5 +1,6 @@
 """One flipped bit, one missing end: noticed by whoever reads the file, repaired by `run`, and never a traceback."""
 
+import json
 import os
 import shutil
 import zlib
@@ -185,3 +186,16 @@ def test_every_stage_is_a_command_that_says_what_is_damaged(slamcli: Slamcli, re
         assert (result.exit_code, "damaged" in result.stderr) in {(1, True), (0, False)}, result.stderr
         flip(path)
     assert set(NAMES) <= set(cli.commands)
+
+
+def test_a_run_of_another_version_is_refused_and_stays_as_it_is(slamcli: Slamcli, room_run: Path, tmp_path: Path) -> None:
+    run = Path(shutil.copytree(room_run, tmp_path / "run"))
+    info = {name: value for name, value in files.read_json(run / "run.json").items() if name != files.SEAL}
+    (run / "run.json").write_text(json.dumps({**info, "format": 4}))
+    (run / "config.toml").write_text("[track]\nrelocalise_inliers = 50\n")
+    before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file() and path.name != ".lock"}
+    for command in (("run", "-r", run), ("status", "-r", run)):
+        result = slamcli(*command)
+        assert result.exit_code == 1
+        assert "a run of format 4" in result.stderr.splitlines()[-1]
+    assert {path: path.read_bytes() for path in before} == before
