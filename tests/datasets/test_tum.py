@@ -38,8 +38,8 @@ def test_association_equals_the_data_sets_script(a: np.ndarray, b: np.ndarray, o
 
 
 def test_the_bound_is_strict() -> None:
-    assert len(associate(np.array([1.0]), np.array([1.02]), max_difference=0.02)) == int(abs(1.0 - 1.02) < 0.02)
-    assert len(associate(np.array([1.0]), np.array([1.5]), max_difference=0.5)) == 0
+    assert len(associate(np.array([1.0]), np.array([1.5]), max_difference=0.5)) == 0  # halves are exact
+    assert len(associate(np.array([1.0]), np.array([np.nextafter(1.5, 0.0)]), max_difference=0.5)) == 1
 
 
 def test_values_of_a_sound_recording(tmp_path: Path) -> None:

@@ -100,8 +100,8 @@ def test_samples_are_distinct_and_even():
     assert (np.sort(camera_pose.draw_samples(np.random.default_rng(3), 4, 9, 4), axis=1) == np.arange(4)).all()
 
 
-@pytest.mark.parametrize("outliers", [0.0, 0.3, 0.5])
-def test_ransac_finds_the_pose_among_outliers(outliers):
+@pytest.mark.parametrize(("outliers", "rounds"), [(0.0, (1, 5)), (0.3, (10, 60)), (0.5, (40, 100))])
+def test_ransac_finds_the_pose_among_outliers(outliers, rounds):
     rng = np.random.default_rng(4)
     T_cw, x_w, xy, *_, is_good = view(rng, 300, outliers=outliers, noise=0.5)
     found = camera_pose.ransac_p3p(x_w, xy, CAMERA, rng=np.random.default_rng(0))
@@ -109,7 +109,7 @@ def test_ransac_finds_the_pose_among_outliers(outliers):
     assert found.n_inliers == found.is_inlier.sum()
     assert (found.is_inlier & is_good).sum() > 0.8 * is_good.sum() and (found.is_inlier & ~is_good).mean() < 0.02
     assert 0.2 < found.rms < 3.0
-    assert found.iterations == 1 or outliers > 0.0 or found.iterations <= 100
+    assert rounds[0] <= found.iterations <= rounds[1]  # it ends when another draw would hardly do better
 
 
 def test_ransac_ranks_as_its_slow_twin():

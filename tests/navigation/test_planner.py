@@ -139,7 +139,10 @@ def test_the_place_that_is_proposed_works():
     with pytest.raises(SlamError) as caught:
         planner.plan(room_with_wall(), (1.0, 2.52), (1.0, 1.0))
     x, y = (float(v) for v in str(caught.value).rsplit(" ", 1)[1].split(","))
-    assert planner.plan(room_with_wall(), (x, y), (1.0, 1.0)).length > 0.0 or y < 2.52
+    assert 0.1 < np.hypot(x - 1.0, y - 2.52) < 0.4  # beside the wall
+    route = planner.plan(room_with_wall(), (x, y), (1.0, 1.0))
+    assert np.hypot(x - 1.0, y - 1.0) - 0.1 < route.length < 2.0
+    np.testing.assert_allclose(route.xy[0], (x, y), atol=0.05)
 
 
 def test_unreachable_says_how_much_is_reachable():
