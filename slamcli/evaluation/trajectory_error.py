@@ -8,7 +8,7 @@ stands beside them. Scale-fitted figures are given as well, never instead.
 [Z] (15), (16); J. Sturm et al., A benchmark for the evaluation of RGB-D SLAM systems, IROS 2012, doi:10.1109/IROS.2012.6385773
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -32,13 +32,18 @@ class Ape:
     stage: str  # "" for a trajectory that is not ours
     n_frames: int  # colour frames of the recording
     n_poses: int  # frames with a pose
-    stamp: np.ndarray  # (N,) [s]
-    error: np.ndarray  # (N,) [m], norm of trans(E_i)
-    x_truth: np.ndarray  # (N, 3) [m], ground-truth frame
-    x_aligned: np.ndarray  # (N, 3) [m], the estimate moved there
-    T_gw: np.ndarray  # (4, 4) the alignment: estimate's world to ground truth
+    stamp: np.ndarray = field(repr=False)  # (N,) [s]
+    error: np.ndarray = field(repr=False)  # (N,) [m], norm of trans(E_i)
+    x_truth: np.ndarray = field(repr=False)  # (N, 3) [m], ground-truth frame
+    x_aligned: np.ndarray = field(repr=False)  # (N, 3) [m], the estimate moved there
+    T_gw: np.ndarray = field(repr=False)  # (4, 4) the alignment: estimate's world to ground truth
     scale: float  # that fits best; 1 is right
     rmse_scaled: float  # [m] after an alignment with that scale
+
+    @property
+    def rmse(self) -> float:
+        """Return the root of the mean squared error [m]; [Z] (16)."""
+        return float(np.sqrt(np.mean(self.error**2)))
 
     @property
     def coverage(self) -> float:
@@ -73,9 +78,9 @@ class Rpe:
     n_poses: int
     delta: float  # the interval
     unit: str  # "s" or "frame"
-    stamp: np.ndarray  # (N,) [s] of the later pose
-    translation: np.ndarray  # (N,) [m]
-    rotation_deg: np.ndarray  # (N,) [degrees]
+    stamp: np.ndarray = field(repr=False)  # (N,) [s] of the later pose
+    translation: np.ndarray = field(repr=False)  # (N,) [m]
+    rotation_deg: np.ndarray = field(repr=False)  # (N,) [degrees]
 
     def to_dict(self) -> dict[str, Any]:
         """Return the figures as plain values; the unprefixed ones are the translation's."""

@@ -16,7 +16,6 @@ from slamcli import __version__
 from slamcli.config.options import Config
 from slamcli.console import counts
 from slamcli.evaluation.run_content import Content
-from slamcli.evaluation.trajectory_error import Ape
 from slamcli.report import doubts
 from slamcli.report.pictures import Picture
 
@@ -88,7 +87,7 @@ def _cards(content: Content) -> str:
         ("loops closed", len(content.loops)),
     ]
     if content.ape.get(content.stage):
-        cards.insert(0, ("APE RMSE", f"{1000 * _rmse(content.ape[content.stage]):.1f} mm"))
+        cards.insert(0, ("APE RMSE", f"{1000 * content.ape[content.stage].rmse:.1f} mm"))
     if content.verdict is not None:
         cards.insert(1, ("free floor", f"{content.verdict.evidence.free_area:.1f} m\u00b2"))
     cards += [
@@ -107,10 +106,6 @@ def _cards(content: Content) -> str:
 
 def _thousands(value: Any) -> str:
     return f"{value:,}".replace(",", "\u202f") if isinstance(value, int) else str(value)
-
-
-def _rmse(ape: Ape) -> float:
-    return float(np.sqrt(np.mean(ape.error**2)))
 
 
 def _remarks(remarks: list[doubts.Remark]) -> str:

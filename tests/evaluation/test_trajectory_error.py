@@ -13,6 +13,7 @@ from finished import disturb, wander
 
 from slamcli.errors import SlamError
 from slamcli.evaluation import trajectory_error
+from slamcli.evaluation.trajectory_error import Ape
 from slamcli.formats.trajectory import read_tum, write_tum
 from slamcli.geometry import se3
 from slamcli.schema import Trajectory
@@ -142,3 +143,10 @@ def test_too_little_to_compare_is_said() -> None:
     short = Trajectory(stamp=truth.stamp[:10] / 100, T_wc=truth.T_wc[:10])
     with pytest.raises(SlamError, match="no two poses to compare over 1 s"):
         trajectory_error.rpe(short, short, frame_stamp=short.stamp, name="a")
+
+
+def test_the_error_prints_in_one_line_and_knows_its_rmse() -> None:
+    error = np.array([0.003, 0.004])
+    ape = Ape("room", "loop", 2, 2, np.arange(2.0), error, np.zeros((2, 3)), np.zeros((2, 3)), np.eye(4), 1.0, 0.0035)
+    assert ape.rmse == pytest.approx(np.sqrt(12.5) * 1e-3)
+    assert "name='room'" in repr(ape) and "array" not in repr(ape)
