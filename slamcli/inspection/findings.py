@@ -107,8 +107,9 @@ def about_files(dataset: Dataset, seen: Pictures) -> list[Finding]:
     """Judge images that cannot be used."""
     if not seen.errors:
         return []
-    n_images = 2 * len(seen.mean_grey)
-    level = ERROR if len(seen.errors) > MANY_FRAMES * n_images else WARNING
+    n_frames, n_without_colour = len(seen.mean_grey), int(np.isnan(seen.mean_grey).sum())
+    worst = max(n_without_colour, len(seen.errors) - n_without_colour)  # colour, depth
+    level = ERROR if worst > MANY_FRAMES * n_frames else WARNING
     more = f" and {len(seen.errors) - 1} more" if len(seen.errors) > 1 else ""
     return [Finding(level, "files", f"{seen.errors[0]}{more}", "such frames are skipped; copy or unpack the recording again")]
 
