@@ -27,9 +27,10 @@ from scipy.spatial import cKDTree
 from slamcli.config import toml
 from slamcli.config.options import Config, MatchConfig
 from slamcli.errors import SlamError
+from slamcli.formats import vocabulary_file
 from slamcli.parallel import ordered_map
 from slamcli.stages.extract import detect as detect_under
-from slamcli.vision import hamming, orb, vocabulary
+from slamcli.vision import bag_of_words, hamming, orb, vocabulary
 from slamcli.vision.comparison import evenness, plain_orb
 
 RADIUS = 3.0  # [px] within which a point is found again, or a match is correct
@@ -179,12 +180,12 @@ def recall(recording: Recording, detect: Detector, words: vocabulary.Vocabulary)
     """
     frames = recording.key_frames(least_shared=KEY_FRAME_SHARED)
     stamp = recording.dataset.stamp[frames]
-    vectors = [vocabulary.word_vector(vocabulary.quantize(words, detect(recording.grey(int(f))).desc)[0], words.idf) for f in frames]
+    vectors = [bag_of_words.word_vector(vocabulary.quantize(words, detect(recording.grey(int(f))).desc)[0], words.idf) for f in frames]
     n_queries, n_found, best = 0, 0, []
     for k, vector in enumerate(vectors):
         earlier = np.flatnonzero(stamp < stamp[k] - REVISIT_AFTER)
         shared = np.array([recording.shared_view(int(frames[k]), int(frames[e])) for e in earlier])
-        index = vocabulary.InvertedIndex(words.n_words)
+        index = bag_of_words.InvertedIndex(words.n_words)
         for row, e in enumerate(earlier):
             index.add(row, *vectors[e])
         found, score = index.query(*vector)
@@ -236,7 +237,7 @@ def report(recording: Recording, settings: Config, n_pairs: int) -> Iterator[str
     works = {name: (lambda d=d: [d(grey) for grey in images]) for name, d in {"OpenCV ORB": orb_bare(), "slamcli": ours}.items()}
     yield from table("CPU time", ((name, {"ms a frame": ms}) for name, ms in cpu_ms(works, len(images)).items()))
     yield from table("threads", [("slamcli", threads(ours, images))])
-    words = vocabulary.load(settings.match.vocabulary)
+    words = vocabulary_file.read(settings.match.vocabulary)
     by_node = ByNode(words, settings.match)
     for apart, pairs in ((1, near), (10, far)):
         yield from table(f"matching, {apart} apart", matched(recording, ours, pairs, {"brute": brute, "words": by_node}).items())

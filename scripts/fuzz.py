@@ -33,7 +33,7 @@ from slamcli.datasets import images, open_dataset
 from slamcli.datasets.intrinsics import read_camera_file
 from slamcli.datasets.lists import read_list, read_pairs
 from slamcli.errors import SlamError
-from slamcli.formats import cloud, dbow2, g2o, grid_map, octomap, trajectory
+from slamcli.formats import cloud, dbow2, g2o, grid_map, octomap, trajectory, vocabulary_file
 from slamcli.geometry.camera import Camera
 from slamcli.geometry.octree import Octree
 from slamcli.runs import damage
@@ -263,7 +263,7 @@ def parsers() -> dict[str, Parser]:
         "g2o": Parser("p.g2o", written("p.g2o", lambda path: g2o.write_g2o(path, np.tile(np.eye(4), (3, 1, 1)), *edges)), g2o.read_g2o),
         "grid_page": Parser("map.yaml", written("map.yaml", lambda path: grid_map.write(path.with_suffix(".pgm"), state)), page),
         "pgm": Parser("picture.pgm", written("picture.pgm", lambda path: grid_map.write(path, state)), grid_map.read_pgm),
-        "vocabulary": Parser("v.npz", written("v.npz", lambda path: vocabulary.save(path, words)), vocabulary.load),
+        "vocabulary": Parser("v.npz", written("v.npz", lambda path: vocabulary_file.write(path, words)), vocabulary_file.read),
         "dbow2": Parser("v.txt", written("v.txt", lambda path: dbow2.write(path, dbow2.Tree(2, 2, words.parent, words.centre[1:], words.node_weight))), read_dbow2),
         "npy": Parser("x.npy", written("closure_T_ij.npy", lambda path: artifacts.save(closures, path.parent)), record),
         "image": Parser("picture", tuple(encoded(kind, rng) for kind in (".png", ".jpg", ".tiff", ".bmp", ".gif", ".pgm", ".exr")), picture),

@@ -1,6 +1,7 @@
 """The rules of import, and of what a compiled kernel may call. Read from the source text: nothing is imported for it."""
 
 import ast
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -22,7 +23,8 @@ FLOORS = (
     ("schema", "artifacts", "parallel", "console", "open3d_loader"),
     ("jit",),
     ("geometry",),
-    ("vision", "formats", "config"),
+    ("vision", "config"),
+    ("formats",),
     ("depth", "estimation"),
     ("navigation", "datasets", "sparse_map"),
     ("dense",),
@@ -40,6 +42,10 @@ FLOORS = (
 )
 FLOOR_OF = {room: floor for floor, rooms in enumerate(FLOORS) for room in rooms}
 CLICK = ("cli",)
+# Rooms of pure numerics: they open no file, and their errors are for a notebook as much as for the command line.
+NUMERICAL = ("geometry", "vision", "depth", "estimation", "sparse_map", "dense", "navigation", "calibration", "slam")
+FILES = ("slamcli.files", "pathlib", "io", "os", "shutil", "tempfile", "zipfile")
+COMMAND_LINE = re.compile(r"slamcli [a-z]|(^|\s)--?[a-z]")
 OPEN3D = ("open3d_loader.py",)
 EVO = ("evaluation/trajectory_error.py",)
 
@@ -103,6 +109,22 @@ def test_heavy_and_interactive_packages_stay_where_they_belong(path: Path) -> No
             assert not is_at_top, f"{here} imports evo at its top"
         if here.startswith("cli/") and is_at_top:
             assert package in {*sys.stdlib_module_names, "click", "slamcli", "__future__"}, f"{here} imports {package} at its top"
+
+
+@pytest.mark.parametrize("path", [path for path in MODULES if layer_of(path) in NUMERICAL], ids=name_of)
+def test_numerical_rooms_open_no_file_and_speak_no_command_line(path: Path) -> None:
+    tree = parsed(path)
+    opened = {name for name, _ in imports(tree) if name in FILES}
+    assert not opened, f"{name_of(path)} imports {sorted(opened)}: files belong to formats/, datasets/ and stages/"
+    assert not any(isinstance(node, ast.Call) and ast.unparse(node.func) == "open" for node in ast.walk(tree))
+    said = {
+        node.value
+        for raised in ast.walk(tree)
+        if isinstance(raised, ast.Raise | ast.Return)
+        for node in ast.walk(raised)
+        if isinstance(node, ast.Constant) and isinstance(node.value, str)
+    }
+    assert not {text for text in said if COMMAND_LINE.search(text)}
 
 
 def is_kernel(function: ast.FunctionDef) -> bool:

@@ -49,8 +49,9 @@ def train(
 
     from slamcli import console
     from slamcli.errors import SlamError
+    from slamcli.formats import vocabulary_file
     from slamcli.runs import vocabulary_training
-    from slamcli.vision import kmeans, vocabulary
+    from slamcli.vision import kmeans
 
     if not out.absolute().parent.is_dir():
         raise SlamError(f"{out}: its folder is not there; make it first, training takes minutes")
@@ -66,7 +67,7 @@ def train(
         origin=origin or f"{len(descriptors)} pictures of {names}",
         progress=console.progress,
     )
-    vocabulary.save(out, made)
+    vocabulary_file.write(out, made)
     click.echo(f"{out}: {made.n_words} words, {out.stat().st_size / 1e6:.1f} MB, from {len(descriptors)} pictures")
 
 
@@ -75,40 +76,39 @@ def train(
 @click.argument("out", type=Target(), required=False)
 def import_(text: Path, out: Path | None) -> None:
     """Read the DBoW2 vocabulary TEXT, such as ORBvoc.txt, and write it to OUT (default: its name with .npz)."""
-    from slamcli.formats import dbow2
+    from slamcli.formats import dbow2, vocabulary_file
     from slamcli.vision import vocabulary
 
     out = out or text.with_suffix(".npz")
     tree = dbow2.read(text)
     made = vocabulary.from_parents(tree.parent, tree.centre, tree.weight, origin=f"DBoW2 text file {text.name}", source=str(text))
-    vocabulary.save(out, made)
+    vocabulary_file.write(out, made)
     click.echo(f"{out}: {made.n_words} words, {out.stat().st_size / 1e6:.1f} MB")
 
 
 @vocab.command(short_help="Write a vocabulary as a DBoW2 text file.")
 @click.argument("out", type=Target())
-@click.argument("vocabulary_file", metavar="[VOCABULARY]", type=click.Path(path_type=Path, dir_okay=False), required=False)
-def export(out: Path, vocabulary_file: Path | None) -> None:
+@click.argument("vocabulary", metavar="[VOCABULARY]", type=click.Path(path_type=Path, dir_okay=False), required=False)
+def export(out: Path, vocabulary: Path | None) -> None:
     """Write VOCABULARY (.npz), or the shipped one, to OUT as text, which ORB-SLAM and DBoW2 read."""
-    from slamcli.formats import dbow2
-    from slamcli.vision import vocabulary
+    from slamcli.formats import dbow2, vocabulary_file
 
-    made = vocabulary.load(vocabulary_file or "")
+    made = vocabulary_file.read(vocabulary or "")
     dbow2.write(out, dbow2.Tree(made.branching, made.depth, made.parent, made.centre[1:], made.node_weight))
     click.echo(f"{out}: {made.n_words} words, {out.stat().st_size / 1e6:.1f} MB")
 
 
 @vocab.command(short_help="Say what a vocabulary is.")
-@click.argument("vocabulary_file", metavar="[VOCABULARY]", type=click.Path(path_type=Path, dir_okay=False), required=False)
+@click.argument("vocabulary", metavar="[VOCABULARY]", type=click.Path(path_type=Path, dir_okay=False), required=False)
 @json_option
-def info(vocabulary_file: Path | None, as_json: bool) -> None:
+def info(vocabulary: Path | None, as_json: bool) -> None:
     """Say what VOCABULARY (.npz), or the shipped one, holds and what it was trained on."""
     import numpy as np
 
-    from slamcli.vision import vocabulary
+    from slamcli.formats import vocabulary_file
 
-    path = vocabulary_file or vocabulary.SHIPPED
-    found = vocabulary.load(path)
+    path = vocabulary or vocabulary_file.SHIPPED
+    found = vocabulary_file.read(path)
     facts = {
         "file": str(path),
         "bytes": path.stat().st_size,

@@ -28,7 +28,7 @@ KINDS = {bool: "true or false", int: "a whole number", float: "a number", str: '
 
 
 def shipped() -> list[str]:
-    """List the configurations that come with slamcli, for `--config NAME`."""
+    """List the configurations that come with slamcli, by name."""
     return sorted(path.stem for path in _shipped_folder().glob("*.toml"))
 
 
@@ -40,13 +40,13 @@ def _shipped_folder() -> Path:
 
 
 def find(name_or_file: str) -> Path:
-    """Find the file that `--config` means: a file, else one of `shipped()`."""
+    """Find a configuration: a file, else one of `shipped()` by its name."""
     path = files.user_path(name_or_file)
     if path.is_file():
         return path
     if name_or_file in shipped():
         return _shipped_folder() / f"{name_or_file}.toml"
-    raise SlamError(f"--config {name_or_file}: neither a file nor one of {', '.join(shipped())}")
+    raise SlamError(f"configuration {name_or_file}: neither a file nor one of {', '.join(shipped())}")
 
 
 def read(path: Path, base: Config | None = None) -> Config:

@@ -214,7 +214,7 @@ def check_size(rows: int, columns: int, resolution: float) -> None:
     if rows * columns > MAX_CELLS:
         raise SlamError(
             f"grid2d: the grid would have {columns} x {rows} cells ({columns * resolution:.0f} m x {rows * resolution:.0f} m); "
-            "check the trajectory (slamcli eval ape), or raise grid2d.resolution"
+            "check the trajectory, or raise grid2d.resolution"
         )
 
 

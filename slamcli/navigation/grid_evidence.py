@@ -43,7 +43,7 @@ def look(depth: np.ndarray, rays: np.ndarray, T_lk: np.ndarray, *, settings: Gri
     cell, half = settings.resolution, int(np.ceil(settings.max_range / settings.resolution)) + 1
     centre = np.floor(T_lk[:2, 3] / cell)
     if not (np.abs(centre) < 1e8).all():
-        raise SlamError("grid2d: a key frame lies absurdly far away; check the trajectory (slamcli eval ape)")
+        raise SlamError("grid2d: a key frame lies absurdly far away; check the trajectory")
     side = 2 * half + 1
     n_band = np.zeros((side, side), dtype=np.int32)
     slices = np.zeros((side, side), dtype=np.uint16)

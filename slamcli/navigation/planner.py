@@ -67,7 +67,7 @@ def nearest_room(
     margin = obstacle_distance(grid, allow_unknown=allow_unknown) - radius
     labels, n_regions = ndimage.label(margin >= 0.0, structure=np.ones((3, 3), dtype=int))
     if n_regions == 0:
-        raise SlamError(f"a robot of {radius:g} m radius fits nowhere in this grid: try a smaller --radius or --allow-unknown")
+        raise SlamError(f"a robot of {radius:g} m radius fits nowhere in this grid: try a smaller radius, or allow unknown cells")
     rows, columns = np.nonzero(labels)
     xy, region = (np.stack([columns, rows], axis=1) + 0.5) * float(grid.resolution) + grid.origin, labels[rows, columns]
     distance = [np.linalg.norm(xy - place, axis=1) for place in places]
@@ -130,7 +130,7 @@ def end_cell(grid: Grid, margin: np.ndarray, name: str, xy: tuple[float, float],
 def _nearest(grid: Grid, margin: np.ndarray, row: int, column: int) -> str:
     rows, columns = np.nonzero(margin >= 0.0)
     if len(rows) == 0:
-        return "; the robot fits nowhere in this grid: try a smaller --radius or --allow-unknown"
+        return "; the robot fits nowhere in this grid: try a smaller radius, or allow unknown cells"
     i = np.argmin((rows - row) ** 2 + (columns - column) ** 2)
     xy = (np.array([columns[i], rows[i]]) + 0.5) * float(grid.resolution) + grid.origin
     return f"; the nearest place with room for the robot is {xy[0]:.2f},{xy[1]:.2f}"
@@ -141,7 +141,7 @@ def _unreachable(grid: Grid, cost: np.ndarray, ends: list[tuple[int, int]], allo
 
     labels, _ = ndimage.label(np.isfinite(cost), structure=np.ones((3, 3), dtype=int))
     area = [float((labels == labels[end]).sum()) * float(grid.resolution) ** 2 for end in ends]
-    hint = "a smaller --radius" if allow_unknown else "a smaller --radius, or --allow-unknown"
+    hint = "a smaller radius" if allow_unknown else "a smaller radius, or allow unknown cells"
     return f"no way leads from start to goal: {area[0]:.1f} m2 can be reached from the start, {area[1]:.1f} m2 from the goal; try {hint}"
 
 

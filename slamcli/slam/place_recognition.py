@@ -3,7 +3,7 @@
 import numpy as np
 
 from slamcli.schema import Words
-from slamcli.vision import vocabulary
+from slamcli.vision.bag_of_words import InvertedIndex
 
 
 def bow_vector(words: Words, frame: int) -> tuple[np.ndarray, np.ndarray]:
@@ -18,7 +18,7 @@ class PlaceIndex:
     def __init__(self, words: Words, kf_frame: np.ndarray) -> None:
         """Index the key frames whose frames are `kf_frame` (K,); `words` are of the recording that they belong to."""
         self.words = words
-        self._index = vocabulary.InvertedIndex(len(words.idf))
+        self._index = InvertedIndex(len(words.idf))
         self._vectors: list[tuple[np.ndarray, np.ndarray]] = []
         for frame in kf_frame:
             self.add(int(frame))

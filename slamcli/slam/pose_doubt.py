@@ -57,7 +57,7 @@ def findings(record: Doubt) -> list[Finding]:
     text = f"the poses of {n} of {len(record.is_doubtful)} frames are doubtful"
     if contradicted > CONTRADICTED:
         text += f", as other views look through {contradicted:.0%} of what is seen: much moves, or the poses are wrong"
-    return [Finding("poses", f"{text}; slamcli report shows which", is_grave=share >= doubt.MANY)]
+    return [Finding("poses", f"{text}; the report shows which", is_grave=share >= doubt.MANY)]
 
 
 def _contradicted(views: Views, moving: np.ndarray) -> np.ndarray:

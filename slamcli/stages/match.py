@@ -8,16 +8,17 @@ import numpy as np
 
 from slamcli import artifacts
 from slamcli.config.options import Config, MatchConfig
+from slamcli.formats import vocabulary_file
 from slamcli.parallel import ordered_map
 from slamcli.schema import Features, Flow, Matches, Words
 from slamcli.stages.contract import Inputs, Summary, Tools
-from slamcli.vision import hamming, optical_flow, vocabulary
+from slamcli.vision import bag_of_words, hamming, optical_flow, vocabulary
 
 
 def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
     """Quantize every feature, make the frames' word vectors, match each frame to those before it."""
     features, settings = inputs.load(Features, "extract"), cfg.match
-    words = _words(features, vocabulary.load(settings.vocabulary), settings)
+    words = _words(features, vocabulary_file.read(settings.vocabulary), settings)
     pairs = [(i, j) for i in range(len(features.stamp)) for j in range(max(0, i - settings.window), i)]
     flowed = inputs.load(Flow, "extract").flow_xy
     match = partial(_match, features, words, flowed, settings)
@@ -41,7 +42,7 @@ def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
 
 def _words(features: Features, words: vocabulary.Vocabulary, settings: MatchConfig) -> Words:
     word, node = vocabulary.quantize(words, features.desc, node_level=settings.node_level, margin=settings.node_margin)
-    bow_offset, bow_word, bow_weight = vocabulary.word_vectors(word, features.offset, words.idf)
+    bow_offset, bow_word, bow_weight = bag_of_words.word_vectors(word, features.offset, words.idf)
     return Words(idf=words.idf, word=word, node=node, bow_offset=bow_offset, bow_word=bow_word, bow_weight=bow_weight)
 
 

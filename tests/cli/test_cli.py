@@ -134,7 +134,7 @@ def test_a_camera_given_once_stays_with_the_run(fake: Path, slamcli: Slamcli) ->
     [
         (["run", "recordings/none"], "recordings/none: no such recording"),
         (["run", "recordings/desk", "-s", "track.min_inlier=3"], "did you mean track.min_inliers?"),
-        (["run", "recordings/desk", "--config", "quick"], "--config quick: neither a file nor one of"),
+        (["run", "recordings/desk", "--config", "quick"], "configuration quick: neither a file nor one of"),
         (["run", "recordings/desk", "--from", "loop", "--until", "track"], "track comes before loop"),
         (["run"], "make one with: slamcli run demo"),
         (["status"], "make one with: slamcli run demo"),

@@ -10,6 +10,7 @@ from click.testing import Result
 from test_files import largest_file
 
 from slamcli.cli.main import cli
+from slamcli.formats import vocabulary_file
 from slamcli.vision import vocabulary
 
 Slamcli = Callable[..., Result]
@@ -39,7 +40,7 @@ def small_vocabulary(folder: Path) -> Path:
     path = folder / "small.npz"
     if not path.exists():
         centre = np.arange(4 * 32, dtype=np.uint8).reshape(4, 32)
-        vocabulary.save(path, vocabulary.from_parents(np.zeros(4, np.int32), centre, np.ones(4), origin="", source="test"))
+        vocabulary_file.write(path, vocabulary.from_parents(np.zeros(4, np.int32), centre, np.ones(4), origin="", source="test"))
     return path
 
 

@@ -128,7 +128,7 @@ def test_a_wrong_file_is_named_with_the_key(tmp_path: Path, text: str, message: 
 def test_an_absent_file_is_named() -> None:
     with pytest.raises(SlamError, match="mine.toml: cannot be read"):
         toml.read(Path("mine.toml"))
-    with pytest.raises(SlamError, match="--config quick: neither a file nor one of accurate, default, fast, robot"):
+    with pytest.raises(SlamError, match="configuration quick: neither a file nor one of accurate, default, fast, robot"):
         toml.resolve(None, "quick", [])
 
 

@@ -146,7 +146,7 @@ def test_the_place_that_is_proposed_works():
 
 
 def test_unreachable_says_how_much_is_reachable():
-    with pytest.raises(SlamError, match=r"7\.\d m2 can be reached from the start, 7\.\d m2 from the goal; try a smaller --radius"):
+    with pytest.raises(SlamError, match=r"7\.\d m2 can be reached from the start, 7\.\d m2 from the goal; try a smaller radius"):
         planner.plan(room_with_wall(gap=(80, 80)), (1.0, 1.0), (1.0, 4.0))
 
 

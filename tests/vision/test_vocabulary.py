@@ -1,34 +1,23 @@
-"""The tree of words: training, quantizing, word vectors, index, files."""
-
-import io
-import zipfile
-from pathlib import Path
+"""The tree of words: training and quantizing."""
 
 import naive
 import numpy as np
 import pytest
+import word_groups
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from word_groups import groups
 
 from slamcli.errors import SlamError
 from slamcli.vision import kmeans, vocabulary
-from slamcli.vision.vocabulary import InvertedIndex, Vocabulary
+from slamcli.vision.vocabulary import Vocabulary
 
 seeds = st.integers(0, 2**32 - 1)
 
 
-def groups(rng: np.random.Generator, n_groups: int, per_group: int, noise: float) -> tuple[np.ndarray, np.ndarray]:
-    """Descriptors strewn around random centres: (centres, descriptors group by group)."""
-    centre = rng.integers(0, 256, (n_groups, 32)).astype(np.uint8)
-    noise_bits = np.packbits(rng.random((n_groups, per_group, 256)) < noise, axis=2)
-    return centre, (centre[:, None] ^ noise_bits).reshape(-1, 32)
-
-
-@pytest.fixture(scope="module")
+@pytest.fixture
 def small() -> Vocabulary:
-    rng = np.random.default_rng(4)
-    _, desc = groups(rng, 60, 20, 0.08)
-    return kmeans.train(np.array_split(rng.permutation(desc), 12), branching=5, depth=3, rng=rng, origin="groups")
+    return word_groups.tree()
 
 
 def distance(a: np.ndarray, b: np.ndarray) -> int:
@@ -154,89 +143,6 @@ def test_no_descriptor_has_no_word(small: Vocabulary) -> None:
     assert word.shape == (0,) and node.shape == (0, 2)
 
 
-def test_a_word_vector_sums_to_one_and_leaves_out_words_of_no_weight() -> None:
-    idf = np.array([0.0, 1.0, 2.0, 3.0], dtype=np.float32)
-    word, weight = vocabulary.word_vector(np.array([3, 1, 1, 0]), idf)
-    assert word.tolist() == [1, 3] and word.dtype == np.int32
-    np.testing.assert_allclose(weight, [2 / 5, 3 / 5])
-    for empty in (np.zeros(0, np.int32), np.zeros(4, np.int32)):
-        word, weight = vocabulary.word_vector(empty, idf)
-        assert len(word) == len(weight) == 0 and weight.dtype == np.float32
-
-
-def test_word_vectors_of_frames_are_those_of_each(small: Vocabulary) -> None:
-    word = np.random.default_rng(0).integers(0, small.n_words, 50).astype(np.int32)
-    offset = np.array([0, 20, 20, 50])
-    bow_offset, bow_word, bow_weight = vocabulary.word_vectors(word, offset, small.idf)
-    for f in range(3):
-        expected = vocabulary.word_vector(word[offset[f] : offset[f + 1]], small.idf)
-        span = slice(bow_offset[f], bow_offset[f + 1])
-        np.testing.assert_array_equal(bow_word[span], expected[0])
-        np.testing.assert_array_equal(bow_weight[span], expected[1])
-
-
-@settings(max_examples=40, deadline=None)
-@given(seeds, st.integers(1, 12))
-def test_the_index_scores_as_the_papers_formula(seed: int, n_frames: int) -> None:
-    rng = np.random.default_rng(seed)
-    vectors = [
-        vocabulary.word_vector(rng.integers(0, 30, rng.integers(0, 15)), np.linspace(0.0, 3, 30, dtype=np.float32)) for _ in range(n_frames)
-    ]
-    index = InvertedIndex(30)
-    for frame in rng.permutation(n_frames):
-        index.add(int(frame), *vectors[frame])
-    query = vectors[int(rng.integers(n_frames))]
-    frames, scores = index.query(*query)
-    expected = [naive.similarity(dict(zip(*query, strict=True)), dict(zip(*vector, strict=True))) for vector in vectors]
-    assert frames.tolist() == [f for f in range(n_frames) if expected[f] > 0]
-    np.testing.assert_allclose(scores, [expected[f] for f in frames], atol=1e-6)
-    assert (scores <= 1 + 1e-6).all()
-
-
-def test_a_frame_is_most_like_itself_and_the_index_grows_past_its_first_size() -> None:
-    rng = np.random.default_rng(1)
-    vectors = [vocabulary.word_vector(rng.integers(0, 5000, 400), np.ones(5000, np.float32)) for _ in range(12)]
-    index = InvertedIndex(5000)
-    for frame, vector in enumerate(vectors):
-        index.add(frame, *vector)
-    for frame, vector in enumerate(vectors):
-        frames, scores = index.query(*vector)
-        assert frames[scores.argmax()] == frame and scores.max() == pytest.approx(1.0, abs=1e-5)
-
-
-@pytest.mark.parametrize("word, weight", [([30], [1.0]), ([-1], [1.0]), ([1, 2], [1.0])])
-def test_words_that_the_index_does_not_have_are_refused(word: list, weight: list) -> None:
-    index = InvertedIndex(30)
-    for use in (lambda *vector: index.add(0, *vector), index.query):
-        with pytest.raises(ValueError, match="does not fit an index of 30 words"):
-            use(np.array(word), np.array(weight))
-
-
-def test_a_file_written_anew_is_read_anew(small: Vocabulary, tmp_path: Path) -> None:
-    vocabulary.save(tmp_path / "v.npz", small)
-    assert vocabulary.load(tmp_path / "v.npz").origin == "groups"
-    vocabulary.save(tmp_path / "v.npz", Vocabulary(small.centre, small.first_child, small.idf, "others"))
-    assert vocabulary.load(tmp_path / "v.npz").origin == "others"
-
-
-def test_a_saved_vocabulary_is_read_back(small: Vocabulary, tmp_path: Path) -> None:
-    path = tmp_path / "words.any_suffix"
-    vocabulary.save(path, small)
-    read = vocabulary.load(path)
-    for name in ("centre", "first_child", "idf"):
-        np.testing.assert_array_equal(getattr(read, name), getattr(small, name))
-        assert getattr(read, name).flags.writeable
-    assert read.origin == "groups"
-
-
-def test_the_shipped_vocabulary_is_what_it_should_be() -> None:
-    shipped = vocabulary.load()
-    assert shipped.n_words >= 10_000
-    assert vocabulary.SHIPPED.stat().st_size <= 5_000_000
-    assert "held out" in shipped.origin
-    assert 0.0 < np.median(shipped.idf) < 10.0
-
-
 def test_children_of_any_tree_are_put_side_by_side(small: Vocabulary) -> None:
     """Nodes renamed at random, parents still first: the rebuilt tree gives every descriptor the same centre as word."""
     rng = np.random.default_rng(3)
@@ -252,68 +158,3 @@ def test_children_of_any_tree_are_put_side_by_side(small: Vocabulary) -> None:
     centre = [v.centre[v.word_of_node >= 0][vocabulary.quantize(v, desc)[0]] for v in (small, rebuilt)]
     assert np.mean((centre[0] == centre[1]).all(axis=1)) > 0.9  # ties may go the other way
     np.testing.assert_allclose(np.sort(rebuilt.idf), np.sort(small.idf))
-
-
-def damaged(small: Vocabulary, **changes: np.ndarray) -> bytes:
-    columns = {
-        "format": np.int32(1),
-        "centre": small.centre,
-        "first_child": small.first_child,
-        "idf": small.idf,
-        "origin": np.zeros(0, np.uint8),
-    }
-    buffer = io.BytesIO()
-    np.savez(buffer, **{name: value for name, value in {**columns, **changes}.items() if value is not None})
-    return buffer.getvalue()
-
-
-@pytest.mark.parametrize(
-    "changes, fault",
-    [
-        ({"idf": None}, "idf is missing"),
-        ({"format": np.int32(99)}, "format 99"),
-        ({"centre": np.zeros((5, 31), np.uint8)}, "centre has type"),
-        ({"centre": np.zeros((5, 32), np.float64)}, "centre has type"),
-        ({"idf": np.array([object()], dtype=object)}, "idf has type|unknown kind|Object"),
-        ({"first_child": np.arange(3, dtype=np.int32)}, "no tree"),
-        ({"first_child": "loop"}, "no tree"),
-        ({"idf": np.ones(3, np.float32)}, "3 weights"),
-        ({"idf": "nan"}, "weight"),
-    ],
-)
-def test_a_damaged_vocabulary_gives_one_line(small: Vocabulary, tmp_path: Path, changes: dict, fault: str) -> None:
-    if isinstance(changes.get("first_child"), str):
-        first = small.first_child.copy()
-        first[2] = 1  # node 1 would be its own child
-        changes = {"first_child": first}
-    if isinstance(changes.get("idf"), str):
-        changes = {"idf": np.full_like(small.idf, np.nan)}
-    path = tmp_path / "bad.npz"
-    path.write_bytes(damaged(small, **changes))
-    with pytest.raises(SlamError, match=fault) as caught:
-        vocabulary.load(path)
-    assert "bad.npz" in str(caught.value) and "\n" not in str(caught.value)
-
-
-def test_a_cut_a_foreign_and_a_missing_file_give_one_line(small: Vocabulary, tmp_path: Path) -> None:
-    whole = damaged(small)
-    contents = {"cut.npz": whole[: len(whole) // 2], "empty.npz": b"", "text.npz": b"10 6 0 0\n0 0 1 2 3"}
-    with zipfile.ZipFile(tmp_path / "short.npz", "w") as archive, zipfile.ZipFile(io.BytesIO(whole)) as original:
-        for name in original.namelist():
-            archive.writestr(name, original.read(name)[:-3] if name == "centre.npy" else original.read(name))
-    for name, content in contents.items():
-        (tmp_path / name).write_bytes(content)
-    for name in [*contents, "short.npz", "missing.npz"]:
-        with pytest.raises(SlamError, match=name) as caught:
-            vocabulary.load(tmp_path / name)
-        assert "\n" not in str(caught.value)
-
-
-def test_a_header_that_promises_too_much_reserves_nothing(small: Vocabulary, tmp_path: Path) -> None:
-    header = io.BytesIO()
-    np.lib.format.write_array_header_1_0(header, {"descr": "|u1", "fortran_order": False, "shape": (10**12, 32)})
-    with zipfile.ZipFile(tmp_path / "huge.npz", "w") as archive, zipfile.ZipFile(io.BytesIO(damaged(small))) as original:
-        for name in original.namelist():
-            archive.writestr(name, header.getvalue() if name == "centre.npy" else original.read(name))
-    with pytest.raises(SlamError, match="rows"):
-        vocabulary.load(tmp_path / "huge.npz")
