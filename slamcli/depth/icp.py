@@ -1,16 +1,17 @@
-"""Alignment on shape: where the picture has no texture, the surfaces that two depth images show say how the camera moved.
+"""Depth ICP: where the picture has no texture, the surfaces that two depth images show say how the camera moved.
 
-Depth images are made coarse, as shape needs no fine detail and the noise of single readings averages out. Points of one meet the point of
+Depth images are made coarse, as surfaces need no fine detail and the noise of single readings averages out. Points of one meet the point of
 the other that they project to, and their distance along its normal is minimized (Y. Chen, G. Medioni, Object Modelling by Registration of
 Multiple Range Images, 1992, doi:10.1016/0262-8856(92)90066-C; projective association: G. Blais, M. Levine, PAMI 1995,
 doi:10.1109/34.400574).
 
-Shape does not always tell: over one plane a camera may shift in two directions and turn about the normal without any change. What is
+Depth does not always tell: over one plane a camera may shift in two directions and turn about the normal without any change. What is
 determined is read from the information matrix.
 """
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 
@@ -23,16 +24,34 @@ from slamcli.geometry.camera import Camera
 COLUMNS = 160  # of a coarse depth image, at least
 UNIT = 2e-4  # [m] of the numbers that coarse depth is kept in
 CLEANING = SurfaceConfig(edge=1, window=1.0, max_angle_deg=75.0)
-# Every so many points, that may be so far apart [m], iterations at most, and the length of a step of the motion that ends them.
-SCHEDULE = np.array([(8.0, 0.3, 8.0, 1e-3), (4.0, 0.12, 6.0, 5e-4), (1.0, 0.06, 4.0, 2e-4)])
 MIN_COSINE = 0.8  # between the normals of points that meet
 HUBER_CHI2 = 4.0
 # Readings err together, by the sensor's correlation window, its steps of disparity and its warp: so many count as one. With 500, chi2 of
 # the motion found is 0.3 for a simulated Kinect, whose readings hardly do, and 50 on fr1_xyz: it should be 6.
 READINGS_AS_ONE = 500.0
-# [m, rad] how far the start is believed to be off: next to nothing beside what shape says, and all there is where it says nothing.
+# [m, rad] how far the start is believed to be off: next to nothing beside what depth says, and all there is where it says nothing.
 START_SIGMA = np.array([0.2, 0.2, 0.2, 0.2, 0.2, 0.2])
 DETERMINED_SIGMA = 0.01  # [m] a direction known to this at the mean depth is determined; noise alone feigns 0.015 to 0.03 over planes
+
+
+class Pass(NamedTuple):
+    """One pass of an alignment, from coarse to fine."""
+
+    every: float  # n-th point takes part
+    reach: float  # [m] that points which meet may be apart
+    iterations: float  # at most
+    least_step: float  # of the motion's twist [m, rad]: a shorter one ends the pass
+
+
+SCHEDULE = np.array([Pass(8, 0.3, 8, 1e-3), Pass(4, 0.12, 6, 5e-4), Pass(1, 0.06, 4, 2e-4)])
+
+
+@dataclass(frozen=True)
+class PosePrior:
+    """What is known of a pose besides what depth says, such as landmarks give."""
+
+    T: np.ndarray  # (4, 4)
+    information: np.ndarray  # (6, 6) of its left twist (rho, phi) [1/m^2, 1/rad^2]
 
 
 @dataclass(frozen=True)
@@ -51,7 +70,7 @@ class OrientedPoints:
 
 @dataclass(frozen=True)
 class Alignment:
-    """A relative pose from shape and the evidence for it."""
+    """A relative pose by depth ICP and the evidence for it."""
 
     T_ij: np.ndarray  # (4, 4), x_i = T_ij x_j
     information: np.ndarray  # (6, 6) of the left twist (rho, phi) of T_ij [1/m^2, 1/rad^2]
@@ -71,7 +90,7 @@ def _blocks(columns: int) -> tuple[int, int, int]:
     return side, (side - width) // 2, width
 
 
-def coarse(depth: np.ndarray) -> np.ndarray:
+def coarsen(depth: np.ndarray) -> np.ndarray:
     """Make a depth image (H, W) float32 [m] coarse: (H // side, W // side) uint16 in UNIT, 0 = none."""
     side, first, width = _blocks(depth.shape[1])
     out = np.empty((depth.shape[0] // side, depth.shape[1] // side), dtype=np.float32)
@@ -86,7 +105,7 @@ def coarse_shape(camera: Camera) -> tuple[int, int]:
     return camera.height // side, camera.width // side
 
 
-def relief(coarse_depth: np.ndarray, camera: Camera, sensor: SensorConfig, *, given: Camera | None = None) -> OrientedPoints:
+def surface_points(coarse_depth: np.ndarray, camera: Camera, sensor: SensorConfig, *, given: Camera | None = None) -> OrientedPoints:
     """Find the surface in a coarse depth image of `camera`.
 
     given : the calibration under which the depth was read, if it was another one
@@ -123,22 +142,20 @@ def coarse_camera(camera: Camera) -> tuple[Camera, np.ndarray]:
     return small, np.where(inside, raw[..., 1] * small.width + raw[..., 0], small.width * small.height)
 
 
-def align(
-    T_ij: np.ndarray, source: OrientedPoints, target: OrientedPoints, *, known: tuple[np.ndarray, np.ndarray] | None = None
-) -> Alignment:
+def align(T_ij: np.ndarray, source: OrientedPoints, target: OrientedPoints, *, prior: PosePrior | None = None) -> Alignment:
     """Move the points of `source` (j) onto the surface of `target` (i), from the start T_ij.
 
-    known : what else is known of T_ij: a pose (4, 4) and the information (6, 6) of its left twist, such as landmarks give
+    prior : what else is known of T_ij
     """
     T = np.array(T_ij, dtype=np.float64, order="C")
-    H_known, b_known = np.diag(START_SIGMA**-2.0), np.zeros(6)
-    if known is not None:
-        H_known = H_known + known[1]
-        b_known = known[1] @ se3.log(known[0] @ se3.inverse(T))
+    H_prior, b_prior = np.diag(START_SIGMA**-2.0), np.zeros(6)
+    if prior is not None:
+        H_prior = H_prior + prior.information
+        b_prior = prior.information @ se3.log(prior.T @ se3.inverse(T))
     H, b = np.zeros((6, 6)), np.zeros(6)
     points = (source.xyz, source.normal, source.variance)
     surface = (target.row, target.xyz, target.normal, target.variance, target.pinhole)
-    met, agree, cost = kernels.align(T, *points, *surface, SCHEDULE, MIN_COSINE, HUBER_CHI2, READINGS_AS_ONE, H_known, b_known, H, b)
+    met, agree, cost = kernels.align(T, *points, *surface, SCHEDULE, MIN_COSINE, HUBER_CHI2, READINGS_AS_ONE, H_prior, b_prior, H, b)
     factor = READINGS_AS_ONE * max(cost / max(agree, 1), kernels.LEAST_VARIANCE_FACTOR)
     return Alignment(
         T_ij=se3.orthonormalize(T),

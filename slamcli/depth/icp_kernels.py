@@ -1,4 +1,4 @@
-"""Kernels of surface.py: depth images made coarse, and point-to-plane alignment by Gauss-Newton."""
+"""Kernels of icp.py: depth images made coarse, and point-to-plane alignment by Gauss-Newton."""
 
 import numpy as np
 from numba import f4, f8, i4, i8

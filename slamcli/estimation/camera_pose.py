@@ -16,13 +16,22 @@ CHI2_95_2DOF, CHI2_95_3DOF = 5.991, 7.815  # 95 % quantiles: an observation of a
 class PoseEstimate:
     """A pose and the evidence for it."""
 
-    T_cw: np.ndarray  # (4, 4); ransac_rigid: T_ba
+    T_cw: np.ndarray  # (4, 4)
     is_inlier: np.ndarray  # (N,) bool
     n_inliers: int
     information: np.ndarray  # (6, 6) inverse covariance of the left twist (rho, phi) [1/m^2, 1/rad^2]; 0 = not estimated
     rms: float  # px, reprojection error of the inliers
     cost: float = np.nan  # robust chi2 of the inliers
     iterations: int = 0  # of RANSAC or of Levenberg-Marquardt
+
+
+@dataclass(frozen=True)
+class RigidMotion:
+    """A rigid motion between two cameras and the evidence for it."""
+
+    T_ba: np.ndarray  # (4, 4) camera a to camera b
+    is_inlier: np.ndarray  # (N,) bool
+    rms: float  # px, in camera b, of the inliers
 
 
 def ransac_p3p(
@@ -68,8 +77,8 @@ def ransac_rigid(
     rounds: int = 100,
     threshold_px: float | np.ndarray = 4.0,
     confidence: float = 0.9999,
-) -> PoseEstimate | None:
-    """Find the rigid motion T_ba (in the result's T_cw) between two cameras that most point pairs agree with.
+) -> RigidMotion | None:
+    """Find the rigid motion between two cameras that most point pairs agree with.
 
     x_a, x_b : (N, 3) [m], the same landmarks in the frames of camera a and b; xy_a, xy_b : (N, 2) [px, undistorted] where each camera
     saw them. A pair is an inlier when point a falls within the threshold of xy_b and point b within the threshold of xy_a.
@@ -84,10 +93,12 @@ def ransac_rigid(
     R_ab = np.swapaxes(T_ba[:, :, :3], 1, 2)
     T_ab = np.ascontiguousarray(np.concatenate([R_ab, -R_ab @ T_ba[:, :, 3:]], axis=2))
     is_inlier = np.zeros(n, dtype=np.bool_)
-    best, done = kernels.rank(
+    best, _ = kernels.rank(
         T_ba, T_ab, x_a, ray_b, x_b, ray_a, True, camera.fx, camera.fy, _squared(threshold_px, n), 3, confidence, is_inlier
     )  # fmt: skip
-    return None if best < 0 else _ransac_estimate(T_ba[best], is_inlier, done, _rms(T_ba[best], x_a, ray_b, camera, is_inlier))
+    if best < 0:
+        return None
+    return RigidMotion(_matrix(T_ba[best]), is_inlier, _rms(T_ba[best], x_a, ray_b, camera, is_inlier))
 
 
 def refine_pose(
@@ -151,9 +162,14 @@ def _best_of_four(solutions: np.ndarray, x: np.ndarray, ray: np.ndarray) -> np.n
     return np.ascontiguousarray(solutions[np.arange(len(x)), chosen])
 
 
+def _matrix(T: np.ndarray) -> np.ndarray:
+    """Return a pose (3, 4) as an orthonormal (4, 4) matrix."""
+    return se3.orthonormalize(np.vstack([T, [0.0, 0.0, 0.0, 1.0]]))
+
+
 def _ransac_estimate(T: np.ndarray, is_inlier: np.ndarray, rounds: int, rms: float) -> PoseEstimate:
     return PoseEstimate(
-        T_cw=se3.orthonormalize(np.vstack([T, [0.0, 0.0, 0.0, 1.0]])),
+        T_cw=_matrix(T),
         is_inlier=is_inlier,
         n_inliers=int(is_inlier.sum()),
         information=np.zeros((6, 6)),

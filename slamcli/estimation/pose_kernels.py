@@ -1,4 +1,4 @@
-"""Kernels of pose.py: ranking of RANSAC's hypotheses, and Levenberg-Marquardt on the motion alone.
+"""Kernels of camera_pose.py: ranking of RANSAC's hypotheses, and Levenberg-Marquardt on the motion alone.
 
 Poses are arrays [R | t], (3, 4) or (4, 4). `ray` is the undistorted pixel on the plane z = 1. An observation's depth is NaN where the
 sensor gave none. All arrays are C-contiguous float64 unless said otherwise.

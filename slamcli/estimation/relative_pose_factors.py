@@ -1,6 +1,6 @@
 """Edges in bundle adjustment: relative poses of key frames that were measured besides the landmarks, as by aligning depth images.
 
-An edge (i, j) says x_i = T_ij x_j. Its residual is e = log(T_iw T_wj T_ij^-1), its chi2 e^T Omega e, as in posegraph.py.
+An edge (i, j) says x_i = T_ij x_j. Its residual is e = log(T_iw T_wj T_ij^-1), its chi2 e^T Omega e, as in pose_graph.py.
 """
 
 from dataclasses import dataclass

@@ -32,18 +32,18 @@ class View:
     """What one frame shows, and from where."""
 
     T_lc: np.ndarray  # (4, 4) camera to level frame
-    relief: OrientedPoints  # its surface, in the camera's frame
+    surface: OrientedPoints  # its surface, in the camera's frame
     missing: float  # share of the pixels without a reading
 
     @property
     def xyz_l(self) -> np.ndarray:
         """Return the points (N, 3) in the level frame [m]."""
-        return se3.transform(self.T_lc, self.relief.xyz.astype(np.float64))
+        return se3.transform(self.T_lc, self.surface.xyz.astype(np.float64))
 
     @property
     def normal_l(self) -> np.ndarray:
         """Return the normals (N, 3) in the level frame."""
-        return self.relief.normal @ self.T_lc[:3, :3].T
+        return self.surface.normal @ self.T_lc[:3, :3].T
 
 
 @dataclass(frozen=True)
@@ -100,15 +100,15 @@ def known_share(grid: Grid, xyz_l: np.ndarray) -> float:
 
 def sees_floor(view: View, *, max_range: float) -> bool:
     """Tell whether a view shows enough of the floor, within `max_range` [m] of the camera, for the grid to learn from it."""
-    sigma = noise_model.depth_sigma(view.relief.xyz[:, 2], base=CLEANING.noise_base, quadratic=CLEANING.noise_quadratic)
-    is_floor = (np.abs(view.xyz_l[:, 2]) < FLOOR_BAND + 2.0 * sigma) & (view.normal_l[:, 2] > UPWARD) & (view.relief.xyz[:, 2] < max_range)
-    return bool(is_floor.sum() >= LEAST_FLOOR * view.relief.row.size)
+    sigma = noise_model.depth_sigma(view.surface.xyz[:, 2], base=CLEANING.noise_base, quadratic=CLEANING.noise_quadratic)
+    is_floor = (np.abs(view.xyz_l[:, 2]) < FLOOR_BAND + 2.0 * sigma) & (view.normal_l[:, 2] > UPWARD) & (view.surface.xyz[:, 2] < max_range)
+    return bool(is_floor.sum() >= LEAST_FLOOR * view.surface.row.size)
 
 
 def is_flat_wall(view: View, *, least: float = 0.9) -> bool:
     """Tell whether one upright plane holds at least the share `least` of what a view shows."""
     xyz, normal = view.xyz_l[::SAMPLED], view.normal_l[::SAMPLED]
-    sigma = 2.0 * noise_model.depth_sigma(view.relief.xyz[::SAMPLED, 2], base=CLEANING.noise_base, quadratic=CLEANING.noise_quadratic)
+    sigma = 2.0 * noise_model.depth_sigma(view.surface.xyz[::SAMPLED, 2], base=CLEANING.noise_base, quadratic=CLEANING.noise_quadratic)
     if len(xyz) < 10:
         return False
     on_plane = np.ones(len(xyz), dtype=bool)
@@ -130,7 +130,7 @@ def twin_distance(view: View, others: Sequence[View]) -> float:
     found = np.nan
     for other in others:
         agree, in_front = compare(other, view)
-        if len(in_front) * SAMPLED >= LEAST_TWIN * view.relief.row.size and len(in_front) > agree:
+        if len(in_front) * SAMPLED >= LEAST_TWIN * view.surface.row.size and len(in_front) > agree:
             found = np.nanmax([found, np.median(in_front)])
     return float(found)
 
@@ -142,23 +142,23 @@ def compare(source: View, target: View) -> tuple[int, np.ndarray]:
     """
     nothing = 0, np.zeros(0)
     T_ts = se3.inverse(target.T_lc) @ source.T_lc
-    if T_ts[2, 2] < 0.2 or not len(source.relief) or not len(target.relief):  # they look apart
+    if T_ts[2, 2] < 0.2 or not len(source.surface) or not len(target.surface):  # they look apart
         return nothing
-    xyz = se3.transform(T_ts, source.relief.xyz[::SAMPLED].astype(np.float64))
-    normal, z = source.relief.normal[::SAMPLED] @ T_ts[:3, :3].T, xyz[:, 2]
-    fx, fy, cx, cy = target.relief.pinhole
+    xyz = se3.transform(T_ts, source.surface.xyz[::SAMPLED].astype(np.float64))
+    normal, z = source.surface.normal[::SAMPLED] @ T_ts[:3, :3].T, xyz[:, 2]
+    fx, fy, cx, cy = target.surface.pinhole
     with np.errstate(divide="ignore", invalid="ignore"):
         column, row = np.rint(xyz[:, 0] / z * fx + cx), np.rint(xyz[:, 1] / z * fy + cy)
-    height, width = target.relief.row.shape
+    height, width = target.surface.row.shape
     is_in = (z > 0.1) & (row >= 0) & (column >= 0) & (row < height) & (column < width)
     if not is_in.any():
         return nothing
-    met = target.relief.row[row[is_in].astype(np.int64), column[is_in].astype(np.int64)]
+    met = target.surface.row[row[is_in].astype(np.int64), column[is_in].astype(np.int64)]
     is_met = met >= 0
     xyz, normal, met = xyz[is_in][is_met], normal[is_in][is_met], met[is_met]
-    n = target.relief.normal[met]
-    in_front = ((xyz - target.relief.xyz[met]) * n).sum(axis=1)
-    sigma = sum(noise_model.depth_sigma(d, base=CLEANING.noise_base, quadratic=CLEANING.noise_quadratic) for d in (xyz[:, 2], target.relief.xyz[met, 2]))  # fmt: skip
+    n = target.surface.normal[met]
+    in_front = ((xyz - target.surface.xyz[met]) * n).sum(axis=1)
+    sigma = sum(noise_model.depth_sigma(d, base=CLEANING.noise_base, quadratic=CLEANING.noise_quadratic) for d in (xyz[:, 2], target.surface.xyz[met, 2]))  # fmt: skip
     is_same = (normal * n).sum(axis=1) > SAME_SURFACE
     limit = THICKNESS + 3.0 * sigma
     return int((is_same & (np.abs(in_front) < limit)).sum()), in_front[is_same & (in_front >= limit) & (in_front < FARTHEST_TWIN)]

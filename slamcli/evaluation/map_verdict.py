@@ -150,6 +150,6 @@ def _views(run: RunDir, T_lw: np.ndarray) -> list[View]:
     poses = [(frame, T_lw @ T_wd) for frame, T_wd in depth_poses(run, frames="all") if images[frame].any()]
     rows = sorted({int(row) for row in np.linspace(0, len(poses) - 1, min(len(poses), map_evidence.MOST_VIEWS))})
     return [
-        View(T_lc, icp.relief(images[frame], camera, sensor, given=given), float((images[frame] == 0).mean()))
+        View(T_lc, icp.surface_points(images[frame], camera, sensor, given=given), float((images[frame] == 0).mean()))
         for frame, T_lc in (poses[row] for row in rows)
     ]

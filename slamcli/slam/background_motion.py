@@ -18,7 +18,7 @@ import numpy as np
 
 from slamcli.config.options import SensorConfig
 from slamcli.depth import icp, icp_kernels
-from slamcli.depth.icp import OrientedPoints
+from slamcli.depth.icp import OrientedPoints, Pass, PosePrior
 from slamcli.estimation import camera_pose, minimal_solvers
 from slamcli.estimation.camera_pose import PoseEstimate
 from slamcli.geometry import se3
@@ -41,7 +41,7 @@ LOOSE = np.array([0.02] * 3 + [0.01] * 3)  # [m, rad] how far ICP may go where n
 TIGHT = np.array([0.007] * 3 + [0.004] * 3)  # of frames between anchors, whose place is nearly known
 POOR_SHARE, POOR_RATIO = 0.4, 10.0  # surface explained, and how many times what contradicts, below which the grid is searched too
 GRID_M, GRID_RAD = (-0.2, -0.1, 0.0, 0.1, 0.2), (-0.12, 0.0, 0.12)  # forward, and turned to a side
-SCHEDULE = np.array([(4.0, 0.10, 6.0, 5e-4), (2.0, 0.05, 5.0, 2e-4)])  # as of depth/icp.py: with a shorter reach
+SCHEDULE = np.array([Pass(4, 0.10, 6, 5e-4), Pass(2, 0.05, 5, 2e-4)])  # with a shorter reach than depth/icp.py
 NEAR_VARIANCE = 4.0  # [m^2] at which distance squared a reading's variance is as the sensor's; nearer counts less
 FAR = 4.0  # [m] beyond which it does not count more
 KEPT = 48  # frame_points
@@ -153,14 +153,14 @@ class BackgroundMotion:
 
     def _refined(self, common: Common, start: Judgement, sigma: np.ndarray) -> list[np.ndarray]:
         """Refine a motion by the matches that agree with it, and then by depth too."""
-        T, known, found = start.T, (start.T, np.diag(sigma**-2.0)), []
+        T, prior, found = start.T, PosePrior(start.T, np.diag(sigma**-2.0)), []
         rows = np.flatnonzero(start.agrees)
         if len(rows) >= LEAST:
             estimate = self._refined_by_matches(T, common, rows)
-            T, known = estimate.T_cw, (estimate.T_cw, estimate.information)
+            T, prior = estimate.T_cw, PosePrior(estimate.T_cw, estimate.information)
             found.append(T)
         if min(len(common.source), len(common.target)) >= LEAST:
-            found.append(_align(T, common.source, common.target, known))
+            found.append(_align(T, common.source, common.target, prior))
         return found
 
     def _refined_by_matches(self, T: np.ndarray, common: Common, rows: np.ndarray) -> PoseEstimate:
@@ -202,7 +202,7 @@ class BackgroundMotion:
         number = cell[:, 1] * CELLS[0] + cell[:, 0]
         share = np.bincount(number, minlength=CELLS[0] * CELLS[1])[number]
         cell_rad2 = self._camera.width * self._camera.height / (CELLS[0] * CELLS[1] * self._camera.fx * self._camera.fy)
-        source, target = self._relief(reference), self._relief(i)
+        source, target = self._surface_points(reference), self._surface_points(i)
         return Common(
             x_r=np.ascontiguousarray(x_r),
             x_i=self._camera.backproject(xy, depth),
@@ -227,9 +227,9 @@ class BackgroundMotion:
         )  # fmt: skip
         return first_r + row[:, 1].astype(np.int64), first_i + row[:, 0].astype(np.int64)
 
-    def _relief(self, frame: int) -> OrientedPoints:
+    def _surface_points(self, frame: int) -> OrientedPoints:
         if frame not in self._frame_points:
-            self._frame_points[frame] = icp.relief(self._depth[frame], self._camera, self._sensor)
+            self._frame_points[frame] = icp.surface_points(self._depth[frame], self._camera, self._sensor)
             if len(self._frame_points) > KEPT:
                 self._frame_points.popitem(last=False)
         return self._frame_points[frame]
@@ -248,20 +248,20 @@ def _explain(T: np.ndarray, source: OrientedPoints, target: OrientedPoints) -> t
     return kernels.explain(T, source.xyz, source.normal, target.row, target.xyz, target.normal, target.pinhole, FLATNESS[0], FLATNESS[1])
 
 
-def _align(T: np.ndarray, source: OrientedPoints, target: OrientedPoints, known: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-    """Move the source's surface onto the target's, all surface counting alike; `known` as in icp.align."""
+def _align(T: np.ndarray, source: OrientedPoints, target: OrientedPoints, prior: PosePrior) -> np.ndarray:
+    """Move the source's surface onto the target's, all surface counting alike; `prior` as in icp.align."""
     T = np.array(T, dtype=np.float64, order="C")
     H, b = np.zeros((6, 6)), np.zeros(6)
-    pull = known[1] @ se3.log(known[0] @ se3.inverse(T))
+    pull = prior.information @ se3.log(prior.T @ se3.inverse(T))
     icp_kernels.align(
         T, source.xyz, source.normal, _variance(source), target.row, target.xyz, target.normal, _variance(target), target.pinhole,
-        SCHEDULE, icp.MIN_COSINE, icp.HUBER_CHI2, icp.READINGS_AS_ONE, np.ascontiguousarray(known[1]), pull, H, b,
+        SCHEDULE, icp.MIN_COSINE, icp.HUBER_CHI2, icp.READINGS_AS_ONE, np.ascontiguousarray(prior.information), pull, H, b,
     )  # fmt: skip
     return se3.orthonormalize(T)
 
 
-def _variance(relief: OrientedPoints) -> np.ndarray:
+def _variance(points: OrientedPoints) -> np.ndarray:
     """Return readings (N,) weights as of the surface that they stand for, which grows with the square of the distance."""
-    z = relief.xyz[:, 2]
-    sigma = np.sqrt(relief.variance) + np.float32(0.005)
+    z = points.xyz[:, 2]
+    sigma = np.sqrt(points.variance) + np.float32(0.005)
     return np.square(sigma) * np.float32(NEAR_VARIANCE) / np.square(np.minimum(z, np.float32(FAR)))

@@ -6,9 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from slamcli.config.options import TrackConfig
+from slamcli.depth.icp import PosePrior
 from slamcli.geometry import se3
-from slamcli.slam.depth_tracking import Placement, Shape
-from slamcli.slam.frame_poses import FramePoses
+from slamcli.slam.depth_tracking import DepthAligner, Placement
+from slamcli.slam.frame_poses import STEADY_INFORMATION, FramePoses
 from slamcli.slam.local_map import LocalMap, MapMatch
 from slamcli.sparse_map.guided_matching import FrameFeatures
 from slamcli.sparse_map.sparse_map import SparseMap
@@ -16,8 +17,6 @@ from slamcli.sparse_map.sparse_map import SparseMap
 SEARCH_KEY_FRAMES = 3  # around, that a frame is aligned with when its reference key frame does not do
 FEW = 10  # landmarks that help depth; fewer are found anywhere
 SEARCH_SECONDS = 2.0  # after so long without a pose, what looks like the depth around the last one may be any place
-# [1/m^2, 1/rad^2] what is known of the motion from one frame to the next when it goes on as before: within 10 mm and 0.6 degrees.
-STEADY = 1e4 * np.eye(6)
 
 
 @dataclass(frozen=True)
@@ -36,7 +35,7 @@ class DepthLocalizer:
         self,
         sparse_map: SparseMap,
         poses: FramePoses,
-        shape: Shape,
+        aligner: DepthAligner,
         local_map: LocalMap,
         settings: TrackConfig,
         *,
@@ -47,7 +46,7 @@ class DepthLocalizer:
         make_reference : asked for a further key frame, nearer to frame i, where the reference of the frame before does not determine
             all directions of motion; it returns that key frame, None where there is none to be had
         """
-        self._sparse_map, self._poses, self._shape, self._local_map = sparse_map, poses, shape, local_map
+        self._sparse_map, self._poses, self._aligner, self._local_map = sparse_map, poses, aligner, local_map
         self._settings, self._make_reference = settings, make_reference
 
     def locate(self, i: int, frame: FrameFeatures, found: MapMatch | None) -> DepthMatch | None:
@@ -68,7 +67,7 @@ class DepthLocalizer:
             poses.lost_reason[i] = f"the depth shows {placed.n_determined} of 6 directions only: a flat wall"
             if found is not None or stamp[i] - stamp[poses.anchored] > self._settings.depth_icp_hold:
                 return None
-            placed = self._shape.place(i, placed.kf, [expected], (expected, STEADY))
+            placed = self._aligner.place(i, placed.kf, [expected], PosePrior(expected, STEADY_INFORMATION))
             if placed is None or not placed.is_sound:
                 return None
         few = self._match_few(frame, placed)
@@ -78,7 +77,9 @@ class DepthLocalizer:
     def _confirm(self, i: int, found: MapMatch) -> Placement | None:
         """Align frame `i` from the pose that landmarks give, which counts as measured too."""
         estimate = found.estimate
-        return self._shape.place(i, int(self._poses.ref_kf[self._poses.latest]), [estimate.T_cw], (estimate.T_cw, estimate.information))
+        return self._aligner.place(
+            i, int(self._poses.ref_kf[self._poses.latest]), [estimate.T_cw], PosePrior(estimate.T_cw, estimate.information)
+        )
 
     def _search(self, i: int, frame: FrameFeatures, expected: np.ndarray) -> Placement | None:
         """Align frame `i` with one key frame after the other, until one determines its pose; else return the best placement.
@@ -89,12 +90,12 @@ class DepthLocalizer:
         reference, segment = int(self._poses.ref_kf[self._poses.latest]), self._poses.segment(self._poses.latest)
         starts = [expected, se3.inverse(self._poses.T_wc(self._poses.latest))]
         best = self._place(i, frame, reference, starts, None)
-        if not self._shape.has_depth(i) or _is_determined(best):
+        if not self._aligner.has_depth(i) or _is_determined(best):
             return best
         made = self._make_reference(i)
         if made is not None:
             best = self._place(i, frame, made, starts, best)
-        around = self._shape.around(se3.inverse(expected), segment)
+        around = self._aligner.around(se3.inverse(expected), segment)
         for kf in around[around != reference][:SEARCH_KEY_FRAMES].tolist():
             if _is_determined(best):
                 break
@@ -106,11 +107,11 @@ class DepthLocalizer:
 
         starts : T_cw, the first as expected, which counts as measured where the background's motion says so
         """
-        placed = self._shape.place(i, kf, starts, (starts[0], STEADY) if self._poses.has_background else None)
+        placed = self._aligner.place(i, kf, starts, PosePrior(starts[0], STEADY_INFORMATION) if self._poses.has_background else None)
         if placed is not None and placed.is_sound and placed.n_determined < 6:
             few = self._match_few(frame, placed)
             if few is not None:
-                placed = self._shape.place(i, kf, [placed.T_cw], (few.estimate.T_cw, few.estimate.information))
+                placed = self._aligner.place(i, kf, [placed.T_cw], PosePrior(few.estimate.T_cw, few.estimate.information))
         is_better = placed is not None and placed.is_sound and (best is None or placed.n_determined > best.n_determined)
         return placed if is_better else best
 

@@ -1,4 +1,4 @@
-"""Frames and key frames placed by the shape that their depth images show, where texture ends."""
+"""Frames and key frames placed by depth ICP, where texture ends."""
 
 from collections import OrderedDict
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ import numpy as np
 
 from slamcli.config.options import SensorConfig
 from slamcli.depth import icp
-from slamcli.depth.icp import Alignment, OrientedPoints
+from slamcli.depth.icp import Alignment, OrientedPoints, PosePrior
 from slamcli.geometry import se3
 from slamcli.geometry.camera import Camera
 from slamcli.parallel import ordered_map
@@ -17,17 +17,17 @@ from slamcli.schema import CoarseDepth
 from slamcli.sparse_map.sparse_map import SparseMap
 
 LEAST_POINTS = 0.05  # share of the coarse pixels that must show a surface
-KEPT = 48  # frame_points, of half a megabyte each
+KEPT = 48  # frames whose points are kept, half a megabyte each
 MIN_AGREEMENT = 0.6  # of the points that meet: less, and it is another place, or the start was too far off
 MIN_OVERLAP = 0.15  # of the points of a key frame, that a frame must still show
-FIT_CHI2 = 50.0  # three times the 99 % quantile of six directions: shape's information is a guess
+FIT_CHI2 = 50.0  # three times the 99 % quantile of six directions: the information of depth is a guess
 JOIN_OVERLAP = 0.25  # that two key frames need for an edge
 JOIN_M, JOIN_COSINE = 1.2, 0.6  # key frames farther apart, or turned by more, are not looked at
 JOIN_MOST = 5  # edges of a new key frame to earlier ones: more of them hold down the drift of a chain
 
 
 class FramePoints:
-    """The frame_points of a recording's frames; those used last are kept. Several threads may ask at once."""
+    """The oriented points of each frame of a recording; those used last are kept. Several threads may ask at once."""
 
     def __init__(self, depth: CoarseDepth, given: Camera, sensor: SensorConfig, *, camera: Camera | None = None) -> None:
         """Take the coarse depth images, read under the calibration `given`; camera : what is known of the camera, if more."""
@@ -36,11 +36,11 @@ class FramePoints:
         self._lock = Lock()
 
     def under(self, camera: Camera) -> "FramePoints":
-        """Return the frame_points as they are under another calibration of the same camera."""
+        """Return the points as another calibration of the same camera gives them."""
         return self if camera == self._camera else FramePoints(self._depth, self._given, self._sensor, camera=camera)
 
     def of(self, frame: int) -> OrientedPoints | None:
-        """Return the relief of a frame, None where it shows too little."""
+        """Return the points of a frame, None where it shows too little."""
         with self._lock:
             if frame in self._kept:
                 self._kept.move_to_end(frame)
@@ -56,8 +56,8 @@ class FramePoints:
         images = self._depth.coarse_depth
         if not 0 <= frame < len(images) or not images[frame].any():
             return None
-        relief = icp.relief(images[frame], self._camera, self._sensor, given=self._given)
-        return relief if len(relief) >= LEAST_POINTS * relief.row.size else None
+        points = icp.surface_points(images[frame], self._camera, self._sensor, given=self._given)
+        return points if len(points) >= LEAST_POINTS * points.row.size else None
 
 
 class NoFramePoints(FramePoints):
@@ -67,7 +67,7 @@ class NoFramePoints(FramePoints):
         """Take nothing."""
 
     def of(self, frame: int) -> None:
-        """Return no relief."""
+        """Return no points."""
 
     def under(self, camera: Camera) -> "NoFramePoints":
         """Return these."""
@@ -79,12 +79,12 @@ NO_FRAME_POINTS = NoFramePoints()
 
 @dataclass(frozen=True)
 class Placement:
-    """Where a frame stands by shape, and the evidence."""
+    """Where a frame stands by depth ICP, and the evidence."""
 
     T_cw: np.ndarray  # (4, 4)
     kf: int  # key frame that it was aligned with
     alignment: Alignment
-    n_determined: int  # of the 6 directions of motion, by shape and by what was known besides
+    n_determined: int  # of the 6 directions of motion, by depth and by the prior
 
     @property
     def is_sound(self) -> bool:
@@ -92,32 +92,32 @@ class Placement:
         return self.alignment.agreement >= MIN_AGREEMENT and self.alignment.overlap >= MIN_OVERLAP
 
     def fits(self, T_cw: np.ndarray) -> bool:
-        """Say whether another pose of the frame contradicts nothing that shape says."""
+        """Say whether another pose of the frame contradicts nothing that depth says."""
         e = se3.log(T_cw @ se3.inverse(self.T_cw))
         return bool(e @ self.alignment.information @ e < FIT_CHI2)
 
 
-class Shape:
+class DepthAligner:
     """Places frames by aligning their depth images with those of key frames."""
 
     def __init__(self, sparse_map: SparseMap, map_frame_points: FramePoints, frame_points: FramePoints) -> None:
-        """Take the map with the frame_points of the recording it is of, and those of the recording whose frames are placed."""
+        """Take the map with the points of the recording it is of, and those of the recording whose frames are placed."""
         self._sparse_map, self._map_frame_points, self._frame_points = sparse_map, map_frame_points, frame_points
 
-    def place(self, frame: int, kf: int, starts: list[np.ndarray], known: tuple[np.ndarray, np.ndarray] | None = None) -> Placement | None:
+    def place(self, frame: int, kf: int, starts: list[np.ndarray], prior: PosePrior | None = None) -> Placement | None:
         """Align a frame with key frame `kf` from the first of the poses `starts` (T_cw) that leads to a sound placement.
 
-        known : a pose T_cw (4, 4) and the information (6, 6) of its left twist, as landmarks give. None where depth is missing.
+        prior : of T_cw. None where depth is missing.
         """
         target, source = self._frame_points.of(frame), self._map_frame_points.of(int(self._sparse_map.kf.frame[kf]))
         if target is None or source is None:
             return None
         T_wk = self._sparse_map.kf.T_wk[kf]
-        besides = None if known is None else (known[0] @ T_wk, known[1])
+        relative = None if prior is None else PosePrior(prior.T @ T_wk, prior.information)
         placement = None
         for T_cw in starts:
-            found = icp.align(T_cw @ T_wk, source, target, known=besides)
-            information = found.information + (0.0 if known is None else known[1])
+            found = icp.align(T_cw @ T_wk, source, target, prior=relative)
+            information = found.information + (0.0 if prior is None else prior.information)
             candidate = Placement(found.T_ij @ se3.inverse(T_wk), kf, found, icp.n_determined(information, found.depth))
             if placement is None or candidate.alignment.agreement > placement.alignment.agreement:
                 placement = candidate
@@ -130,7 +130,7 @@ class Shape:
         return self._frame_points.of(frame) is not None
 
     def fixes_all(self, frame: int) -> bool:
-        """Say whether the shape that a frame shows determines all directions of motion, so that a map can begin with it."""
+        """Say whether the surfaces that a frame shows determine all directions of motion, so that a map can begin with it."""
         # Not by itself: the errors of its normals would agree, and a wall would seem rough.
         here, there = self._frame_points.of(frame), self._frame_points.of(frame + 1) or self._frame_points.of(frame - 1)
         if here is None or there is None:

@@ -1,4 +1,4 @@
-"""The second look: key frames by their depth images, then every frame by landmarks, meet the final map again. Only a batch program can."""
+"""Final refinement: key frames by their depth images, then every frame by landmarks, meet the final map again. Only a batch program can."""
 
 from dataclasses import replace
 from itertools import chain
@@ -14,7 +14,7 @@ from slamcli.geometry import se3
 from slamcli.geometry.camera import Camera
 from slamcli.parallel import ordered_map
 from slamcli.schema import KEY_FRAME, LOST, ON_DEPTH, RELOCALIZED, Features, Tracks
-from slamcli.slam.depth_tracking import FramePoints, Shape
+from slamcli.slam.depth_tracking import DepthAligner, FramePoints
 from slamcli.sparse_map import guided_matching, map_adjustment
 from slamcli.sparse_map.frame import frame_features, refine_on_landmarks
 from slamcli.sparse_map.sparse_map import SparseMap
@@ -48,7 +48,7 @@ def refine_all(
     if depth_icp_edges:
         T_cd = rolling_shutter.depth_to_colour(sparse_map.features, sensing.timing, sparse_map.kf.frame)
         frame_points = frame_points.under(sensing.camera)
-        Shape(sparse_map, frame_points, frame_points).join_covisible(T_cd, most=depth_icp_edges, least=SHARED, workers=workers)
+        DepthAligner(sparse_map, frame_points, frame_points).join_covisible(T_cd, most=depth_icp_edges, least=SHARED, workers=workers)
     kfs = np.arange(len(sparse_map.kf), dtype=np.int32)
     result = map_adjustment.adjust(sparse_map, kfs, sensing.camera, sensor, max_iterations=iterations, edge_weight=depth_icp_weight)
     tracks = refine_frames(sparse_map, sparse_map.features, tracks, sensing.camera, sensor, settings, progress, workers=workers)
@@ -91,31 +91,31 @@ def refine_frames(
     """Refine every frame against the landmarks around it; lost ones are tried from both sides.
 
     features, tracks : of the frames, which may be of another recording than the map; workers : threads
-    A frame keeps its pose where much fewer landmarks agree than before, and a key frame also where so few do that shape held it.
+    A frame keeps its pose where much fewer landmarks agree than before, and a key frame also where so few do that depth held it.
     Returns new Tracks; the map stays as it is.
     """
-    look = _Look(sparse_map, features, tracks, camera, sensor, settings)
+    refinement = _Refinement(sparse_map, features, tracks, camera, sensor, settings)
     n = len(tracks.state)
     # The few landmarks around a frame on shape would make its pose worse.
     chosen = np.flatnonzero((tracks.state != LOST) & (tracks.state != ON_DEPTH))
     # No frame depends on another; those that follow one another on one key frame share the landmarks around it.
     spans = np.split(chosen, np.flatnonzero(np.diff(tracks.ref_kf[chosen])) + 1)
-    refined = ordered_map(look.again, spans, workers=workers)
-    for i, estimate in progress(chain.from_iterable(refined), "hindsight", len(chosen)):
+    refined = ordered_map(refinement.again, spans, workers=workers)
+    for i, estimate in progress(chain.from_iterable(refined), "final refinement", len(chosen)):
         if estimate is not None:
-            look.record(i, int(tracks.ref_kf[i]), estimate)
+            refinement.record(i, int(tracks.ref_kf[i]), estimate)
     for order, step in ((range(n), -1), (range(n - 1, -1, -1), 1)):
         for i in order:  # a lost frame begins where its neighbour in time stands
             j = i + step
-            is_open = look.state[i] == LOST and 0 <= j < n and look.ref_kf[j] >= 0
-            if is_open and look.place(i, look.T_wc[j], int(look.ref_kf[j]), widening=LOST_WIDENING):
-                look.place(i, look.T_wc[i], int(look.ref_kf[i]))
-                look.state[i] = RELOCALIZED
-    return Tracks(ref_kf=look.ref_kf, T_kc=look.T_kc, state=look.state, n_inliers=look.n_inliers)
+            is_open = refinement.state[i] == LOST and 0 <= j < n and refinement.ref_kf[j] >= 0
+            if is_open and refinement.place(i, refinement.T_wc[j], int(refinement.ref_kf[j]), widening=LOST_WIDENING):
+                refinement.place(i, refinement.T_wc[i], int(refinement.ref_kf[i]))
+                refinement.state[i] = RELOCALIZED
+    return Tracks(ref_kf=refinement.ref_kf, T_kc=refinement.T_kc, state=refinement.state, n_inliers=refinement.n_inliers)
 
 
-class _Look:
-    """The second look at frames, and what it found."""
+class _Refinement:
+    """The refinement of frames, and what it found."""
 
     def __init__(
         self, sparse_map: SparseMap, features: Features, tracks: Tracks, camera: Camera, sensor: SensorConfig, settings: TrackConfig

@@ -1,4 +1,4 @@
-"""Find the poses of frames, one after the other, in a map: predict, match, estimate, meet the local map, else relocalize; [Z] 1.2."""
+"""Find the poses of frames in a map: predict, match, estimate, refine on the local map; else depth ICP, else relocalization; [Z] 1.2."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -9,8 +9,8 @@ from slamcli.config.options import SensorConfig, TrackConfig
 from slamcli.geometry.camera import Camera
 from slamcli.schema import ON_DEPTH, RELOCALIZED, TRACKED, Features, Matches, Tracks, Words
 from slamcli.slam import initial_pose
-from slamcli.slam.depth_localization import DepthLocalizer
-from slamcli.slam.depth_tracking import NO_FRAME_POINTS, FramePoints, Placement, Shape
+from slamcli.slam.depth_localization import DepthLocalizer, DepthMatch
+from slamcli.slam.depth_tracking import NO_FRAME_POINTS, DepthAligner, FramePoints, Placement
 from slamcli.slam.frame_poses import FramePoses
 from slamcli.slam.initial_pose import PreviousFrame
 from slamcli.slam.local_map import LocalMap, MapMatch
@@ -65,9 +65,9 @@ class Localizer:
         self._settings, self._sensor, self._rng = settings, sensor, rng
         self.poses = FramePoses(sparse_map, features.stamp, background)
         self.previous = PreviousFrame(sparse_map, matches, camera)
-        self.shape = Shape(sparse_map, map_frame_points, frame_points)
+        self.aligner = DepthAligner(sparse_map, map_frame_points, frame_points)
         self._local_map = LocalMap(sparse_map, camera, settings)
-        self._by_depth = DepthLocalizer(sparse_map, self.poses, self.shape, self._local_map, settings, make_reference=make_reference)
+        self._by_depth = DepthLocalizer(sparse_map, self.poses, self.aligner, self._local_map, settings, make_reference=make_reference)
         self._relocalizer = Relocalizer(sparse_map, places, words, camera, settings, rng)
 
     def process(self, i: int) -> None:
@@ -85,31 +85,35 @@ class Localizer:
         return self.poses.tracks()
 
     def locate(self, i: int, frame: FrameFeatures) -> Location | None:
-        """Find the pose of frame `i` and record it; None, and the reason recorded, where it is lost."""
-        sees_enough, state = len(frame) >= self._settings.min_inliers, TRACKED
-        found = self._follow(i, frame) if sees_enough else None
+        """Find the pose of frame `i` and record it; None, and the reason recorded, where it is lost.
+
+        By the landmarks that the frame before it saw; by depth ICP where these are few; by a key frame that looks alike where both fail.
+        """
+        found = self._follow(i, frame)
         if found is None or found.estimate.n_inliers < self._settings.depth_icp_below:
-            location = self._locate_by_depth(i, frame, found)
-            if location is not None:
-                return location
-        if found is None and sees_enough:
-            found, state = self._relocalize(i, frame), RELOCALIZED
-        if found is None:
-            self.poses.lost_reason.setdefault(i, self._why_lost(frame))
-            return None
-        kf = int(np.argmax(self._sparse_map.votes(found.landmark[found.landmark >= 0])))
-        self.poses.attach(i, kf, found.estimate.T_cw, state=state, n_inliers=found.estimate.n_inliers)
-        return Location(found.landmark, None)
+            by_depth = self._by_depth.locate(i, frame, found)
+            if by_depth is not None:
+                return self._record_by_depth(i, by_depth)
+        if found is not None:
+            return self._record(i, found, TRACKED)
+        found = self._relocalize(i, frame)
+        if found is not None:
+            return self._record(i, found, RELOCALIZED)
+        self.poses.lost_reason.setdefault(i, self._why_lost(frame))
+        return None
 
     def _follow(self, i: int, frame: FrameFeatures) -> MapMatch | None:
-        """Track frame `i` from the one before it: predict, match, estimate, and meet the local map; None if that one is lost or too little agrees."""
-        if not self.poses.has_pose(i - 1):
+        """Track frame `i` from the one before it: predict, match, estimate, refine on the local map; None if that one is lost or too little agrees."""
+        if self._sees_too_little(frame) or not self.poses.has_pose(i - 1):
             return None
         predicted = self.poses.predict(i, i - 1)
-        found = self.previous.correspondences(i, self.poses.T_wc(i - 1))
-        estimate = initial_pose.estimate(found, predicted, frame, self._camera, self._settings, self._rng)
-        T_cw, ids = (predicted, self.previous.landmark) if estimate is None else (estimate.T_cw, found.landmark[estimate.is_inlier])
-        return self._local_map.match(frame, T_cw, self._still_known(i, ids), wanted=self._settings.min_inliers)
+        pairs = self.previous.correspondences(i, self.poses.T_wc(i - 1))
+        estimate = initial_pose.estimate(pairs, predicted, frame, self._camera, self._settings, self._rng)
+        if estimate is None:
+            start, seeds = predicted, self.previous.landmark
+        else:
+            start, seeds = estimate.T_cw, pairs.landmark[estimate.is_inlier]
+        return self._local_map.match(frame, start, self._still_known(i, seeds), wanted=self._settings.min_inliers)
 
     def _still_known(self, i: int, ids: np.ndarray) -> np.ndarray:
         """List those of `ids` that still are landmarks; where none is, all of the reference key frame of the frame before `i`."""
@@ -117,20 +121,28 @@ class Localizer:
         ids = ids[ids >= 0]
         return ids if len(ids) else self._sparse_map.landmarks_of(int(self.poses.ref_kf[i - 1]))
 
-    def _locate_by_depth(self, i: int, frame: FrameFeatures, found: MapMatch | None) -> Location | None:
-        placed = self._by_depth.locate(i, frame, found)
-        if placed is None:
-            return None
-        placement, n_inliers = placed.placement, int((placed.landmark >= 0).sum())
-        self.poses.attach(i, placement.kf, placement.T_cw, state=ON_DEPTH, n_inliers=n_inliers, is_anchored=placed.is_anchored)
-        return Location(placed.landmark, placement)
-
     def _relocalize(self, i: int, frame: FrameFeatures) -> MapMatch | None:
-        place = self._relocalizer.find(i, frame)
+        """Find frame `i` by a key frame that looks alike, wherever it is; None where none does."""
+        place = None if self._sees_too_little(frame) else self._relocalizer.find(i, frame)
         return None if place is None else self._local_map.match(frame, *place, wanted=self._settings.relocalize_inliers)
 
+    def _record(self, i: int, found: MapMatch, state: int) -> Location:
+        """Record frame `i` relative to the key frame that shares the most of its landmarks."""
+        kf = int(np.argmax(self._sparse_map.votes(found.landmark[found.landmark >= 0])))
+        self.poses.attach(i, kf, found.estimate.T_cw, state=state, n_inliers=found.estimate.n_inliers)
+        return Location(found.landmark, None)
+
+    def _record_by_depth(self, i: int, found: DepthMatch) -> Location:
+        """Record frame `i` relative to the key frame that its depth image was aligned with."""
+        placement, n_inliers = found.placement, int((found.landmark >= 0).sum())
+        self.poses.attach(i, placement.kf, placement.T_cw, state=ON_DEPTH, n_inliers=n_inliers, is_anchored=found.is_anchored)
+        return Location(found.landmark, placement)
+
+    def _sees_too_little(self, frame: FrameFeatures) -> bool:
+        return len(frame) < self._settings.min_inliers
+
     def _why_lost(self, frame: FrameFeatures) -> str:
-        if len(frame) < self._settings.min_inliers:
+        if self._sees_too_little(frame):
             return f"{len(frame)} features: blank or unreadable image"
         return f"fewer than {self._settings.min_inliers} of {len(frame)} features agree with the map"
 

@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from slamcli.geometry import se3
-from slamcli.slam import loop_closing
-from slamcli.slam.loop_closing import Candidate
+from slamcli.slam import loop_pose_graph
+from slamcli.slam.loop_candidates import Candidate
 from slamcli.sparse_map.sparse_map import SparseMap
 
 AGREE_M, AGREE_RAD = 0.1, 0.05  # closures that differ by less agree on how two segments lie
@@ -67,5 +67,5 @@ def join(sparse_map: SparseMap, found: Join) -> None:
     is_b = sparse_map.kf.segment == found.b
     T_wk = sparse_map.kf.T_wk.copy()
     T_wk[is_b] = found.T_ab @ T_wk[is_b]
-    loop_closing.apply(sparse_map, T_wk)
+    loop_pose_graph.move(sparse_map, T_wk)
     sparse_map.kf.segment[is_b] = found.a

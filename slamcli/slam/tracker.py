@@ -8,14 +8,12 @@ from slamcli.geometry.camera import Camera
 from slamcli.schema import KEY_FRAME, ON_DEPTH, TRACKED, Features, Map, Matches, Tracks, Words
 from slamcli.slam import key_frames
 from slamcli.slam.depth_tracking import NO_FRAME_POINTS, FramePoints, Placement
+from slamcli.slam.frame_poses import STEADY_INFORMATION
 from slamcli.slam.localizer import Localizer, Location, nothing_seen
 from slamcli.slam.map_growth import MapGrowth
 from slamcli.slam.place_recognition import PlaceIndex
 from slamcli.sparse_map.guided_matching import FrameFeatures
 from slamcli.sparse_map.sparse_map import SparseMap
-
-# [1/m^2, 1/rad^2] of the background's motion between key frames: within 10 mm and 0.6 degrees.
-BACKGROUND_INFORMATION = 1e4 * np.eye(6)
 
 
 class Tracker:
@@ -59,7 +57,7 @@ class Tracker:
             frame_points=frame_points,
             map_frame_points=frame_points,
             background=background,
-            make_reference=self._make_reference,
+            make_reference=self._add_previous_as_key_frame,
         )
         self._poses, self._previous = self._localizer.poses, self._localizer.previous
         self._growth = MapGrowth(self._sparse_map, camera, settings, sensor)
@@ -68,7 +66,10 @@ class Tracker:
         self._first_lost = -1  # of these
 
     def process(self, i: int) -> None:
-        """Register frame `i`: locate it in the map, and make it a key frame where the rule asks for one. Frames come in order."""
+        """Register frame `i`: locate it in the map, and make it a key frame where the rule asks for one. Frames come in order.
+
+        Locating by depth may make the frame before it a key frame, see `DepthLocalizer`.
+        """
         frame = self._localizer.features_of(i)
         if self._segment < 0:
             self._previous.remember(frame, self._start_segment(i, frame))
@@ -128,7 +129,7 @@ class Tracker:
         known = landmark[landmark >= 0]
         # Landmarks enough to recognize a place by hold the key frame; depth alone might slide along a corridor.
         if self._poses.state[i] == ON_DEPTH and len(known) < self._settings.relocalize_inliers:
-            self._localizer.shape.join(kf)
+            self._localizer.aligner.join(kf)
         if self._background is not None:
             self._join_by_background(kf, self._background)
         self._poses.make_key_frame(i, kf)
@@ -142,9 +143,9 @@ class Tracker:
         if len(before):
             other = int(before[-1])
             T_ij = se3.inverse(T_wb[frame[kf]]) @ T_wb[frame[other]]
-            self._sparse_map.add_edge(kf, other, T_ij, BACKGROUND_INFORMATION)
+            self._sparse_map.add_edge(kf, other, T_ij, STEADY_INFORMATION)
 
-    def _make_reference(self, i: int) -> int | None:
+    def _add_previous_as_key_frame(self, i: int) -> int | None:
         """Make the frame before `i` a key frame that depth can be aligned with; None where its own pose is not fully measured."""
         previous = self._previous.features
         if previous is None or self._poses.anchored != i - 1 or self._poses.state[i - 1] not in (TRACKED, ON_DEPTH):
@@ -157,7 +158,7 @@ class Tracker:
     def _start_segment(self, i: int, frame: FrameFeatures) -> np.ndarray:
         """Make frame `i` the first key frame of a new segment if it sees enough with depth; returns the landmarks of its features."""
         n_depth = int(np.isfinite(frame.depth).sum())
-        if n_depth < self._settings.start_features and not self._localizer.shape.fixes_all(i):
+        if n_depth < self._settings.start_features and not self._localizer.aligner.fixes_all(i):
             if self._segment < 0:
                 seen = f"{len(frame)} features, {n_depth} with depth, {self._settings.start_features} wanted"
                 self.lost_reason[i] = f"no map yet: {seen}, and depth shows too little shape to begin with"
@@ -168,7 +169,7 @@ class Tracker:
 
     def _lose(self, i: int, frame: FrameFeatures) -> np.ndarray:
         """Count a lost frame; after too many that could have been recognized, begin a new segment. Returns the landmarks of its features."""
-        if len(frame) >= self._settings.min_inliers or self._localizer.shape.fixes_all(i):
+        if len(frame) >= self._settings.min_inliers or self._localizer.aligner.fixes_all(i):
             self._first_lost = i if self._n_lost == 0 else self._first_lost
             self._n_lost += 1
         if 0 < self._settings.segment_after <= self._n_lost:

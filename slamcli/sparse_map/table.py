@@ -10,7 +10,7 @@ class Table:
     """
 
     def __init__(self, **columns: tuple):
-        """Return each column as ``name=(dtype, *row_shape)``."""
+        """Take each column as ``name=(dtype, *row_shape)``."""
         self._columns = {name: np.empty((256, *shape), dtype=dtype) for name, (dtype, *shape) in columns.items()}
         self._n = 0
 

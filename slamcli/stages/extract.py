@@ -92,7 +92,7 @@ def _extract(dataset: Dataset, settings: ExtractConfig, i: int) -> Frame:
     read = at_key_points.depth_at(depth, points.xy, window=settings.depth_window)
     if settings.depth_jump:
         read = np.where(at_key_points.is_behind_outline(depth, points.xy, jump=settings.depth_jump), np.float32(np.nan), read)
-    return Frame(points, read, at_key_points.inverse_depth_slope(depth, points.xy), icp.coarse(depth), faults)
+    return Frame(points, read, at_key_points.inverse_depth_slope(depth, points.xy), icp.coarsen(depth), faults)
 
 
 def detect(grey: np.ndarray, settings: ExtractConfig) -> orb.KeyPoints:

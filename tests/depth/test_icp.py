@@ -17,7 +17,7 @@ LENS = Camera(160, 120, 147.3, 152.3, 79.5, 59.5, k1=0.2312, k2=-0.7849, p1=-0.0
 
 def relief(T_lc: np.ndarray, seed: int | None = None, **scene) -> icp.OrientedPoints:
     depth = render(T_lc, KINECT, **scene)
-    return icp.relief(icp.coarse(depth if seed is None else noisy(depth, seed)), KINECT, SENSOR)
+    return icp.surface_points(icp.coarsen(depth if seed is None else noisy(depth, seed)), KINECT, SENSOR)
 
 
 def error(found: icp.Alignment, T_li: np.ndarray, T_lj: np.ndarray) -> np.ndarray:
@@ -48,7 +48,7 @@ def test_the_lens_is_taken_out():
     fine = Camera(640, 480, 4 * LENS.fx, 4 * LENS.fy, 4 * LENS.cx, 4 * LENS.cy)
     at = np.rint(4 * ideal).astype(int).clip([0, 0], [639, 479])
     depth = [render(t, fine)[at[..., 1], at[..., 0]] for t in T]
-    source, target = (icp.relief(icp.coarse(d), LENS, SENSOR) for d in depth)
+    source, target = (icp.surface_points(icp.coarsen(d), LENS, SENSOR) for d in depth)
     e = error(icp.align(np.eye(4), source, target), T[1], T[0])
     assert np.linalg.norm(e[:3]) < 0.004 and np.linalg.norm(e[3:]) < 0.002
 
@@ -59,7 +59,7 @@ def test_what_is_known_besides_decides_where_shape_says_nothing():
     source, target = (relief(t, s, **wall) for s, t in enumerate(T))
     true = se3.inverse(T[1]) @ T[0]
     free = icp.align(np.eye(4), source, target)
-    tied = icp.align(np.eye(4), source, target, known=(true, np.diag([1e6, 1e6, 0.0, 0.0, 0.0, 1e6])))
+    tied = icp.align(np.eye(4), source, target, prior=icp.PosePrior(true, np.diag([1e6, 1e6, 0.0, 0.0, 0.0, 1e6])))
     assert abs(error(free, T[1], T[0])[0]) > 0.1
     assert np.abs(error(tied, T[1], T[0])).max() < 0.01
 
@@ -153,7 +153,7 @@ def test_coarse_depth_is_the_mean_of_what_is_nearest():
     depth[0:40, 0:40] = np.nan
     depth[100:104, 100:104] = np.nan
     depth[101, 101:103] = 1.5  # two of the four in the middle of a block: not enough
-    coarse = icp.coarse(depth)
+    coarse = icp.coarsen(depth)
     assert coarse.shape == icp.coarse_shape(camera) == (120, 160)
     np.testing.assert_allclose(coarse[50, [20, 79, 80, 150]] * icp.UNIT, [2.0, 2.0, 1.0, 1.0], atol=1e-4)
     assert (coarse[:10, :10] == 0).all() and coarse[25, 25] == 0
@@ -175,8 +175,8 @@ def test_coarse_depth_is_the_mean_of_what_is_nearest():
     ids=["zeros", "NaN", "infinite", "negative", "far", "noise"],
 )
 def test_depth_that_shows_nothing_determines_nothing(depth):
-    coarse = icp.coarse(depth.astype(np.float32))
-    empty = icp.relief(coarse, KINECT, SENSOR)
+    coarse = icp.coarsen(depth.astype(np.float32))
+    empty = icp.surface_points(coarse, KINECT, SENSOR)
     for source, target in ((empty, relief(HERE)), (relief(HERE), empty), (empty, empty)):
         found = icp.align(np.eye(4), source, target)
         assert np.isfinite(found.T_ij).all() and found.overlap < 0.2
@@ -187,6 +187,6 @@ def test_depth_that_shows_nothing_determines_nothing(depth):
 def test_images_of_any_size_are_taken(size):
     height, width = size
     camera = Camera(width, height, float(width), float(width), (width - 1) / 2, (height - 1) / 2)
-    found = icp.relief(icp.coarse(np.full(size, 1.5, np.float32)), camera, SENSOR)
+    found = icp.surface_points(icp.coarsen(np.full(size, 1.5, np.float32)), camera, SENSOR)
     assert found.row.shape == icp.coarse_shape(camera) and (found.row < len(found)).all()
     icp.align(np.eye(4), found, found)

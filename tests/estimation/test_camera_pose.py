@@ -169,7 +169,7 @@ def test_rigid_ransac_finds_the_motion_and_checks_both_images():
     xy_b[60:120] += 30.0  # wrong in b alone
     found = camera_pose.ransac_rigid(x_a, x_b, xy_a, xy_b, CAMERA, rng=rng, rounds=200, threshold_px=6.0)
     assert not found.is_inlier[:120].any() and found.is_inlier[120:].mean() > 0.7
-    assert 1e-6 < np.linalg.norm(distance(found.T_cw, T_ba)) < 0.1
+    assert 1e-6 < np.linalg.norm(distance(found.T_ba, T_ba)) < 0.1
 
 
 # --- refinement

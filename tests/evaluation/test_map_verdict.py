@@ -36,8 +36,8 @@ def recorded(T_lc, *, boxes=FURNITURE, far=4.0, holes=0.0, seed=0):
 
 
 def views_of(images, T_lc):
-    coarse = [icp.coarse(depth) for depth in images]
-    return [View(T, icp.relief(c, KINECT, SENSOR), float((c == 0).mean())) for c, T in zip(coarse, T_lc, strict=True)]
+    coarse = [icp.coarsen(depth) for depth in images]
+    return [View(T, icp.surface_points(c, KINECT, SENSOR), float((c == 0).mean())) for c, T in zip(coarse, T_lc, strict=True)]
 
 
 def judged(T_lc, images, *, is_floor_found=True, placed=None) -> Verdict:

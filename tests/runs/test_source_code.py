@@ -90,7 +90,7 @@ def test_every_file_that_is_set_apart_exists_and_the_options_hold_no_code() -> N
     ("file", "concerned", "unconcerned"),
     [
         ("slam/tracker.py", {"track"}, {"extract", "match", "densify", "octree", "grid2d"}),
-        ("slam/loop_closing.py", {"loop"}, {"extract", "match", "densify", "octree", "grid2d"}),
+        ("slam/loop_verification.py", {"loop"}, {"extract", "match", "densify", "octree", "grid2d"}),
         ("vision/quadtree.py", {"extract"}, {"match", "densify", "octree", "grid2d"}),
         ("data/vocabulary.npz", {"match"}, {"extract", "densify", "octree", "grid2d"}),
         ("stages/grid2d.py", {"grid2d"}, set(NAMES) - {"grid2d"}),

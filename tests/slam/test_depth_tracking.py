@@ -13,8 +13,8 @@ from slamcli.config.options import LoopConfig, SensorConfig, TrackConfig
 from slamcli.depth import icp
 from slamcli.geometry import se3
 from slamcli.schema import KEY_FRAME, LOST, ON_DEPTH, CoarseDepth, Features, Matches, Timing, Tracks, Words, frame_poses
-from slamcli.slam import final_refinement, loop_closing
-from slamcli.slam.depth_tracking import FramePoints, Shape
+from slamcli.slam import final_refinement, loop_pose_graph
+from slamcli.slam.depth_tracking import DepthAligner, FramePoints
 from slamcli.slam.tracker import Tracker
 from slamcli.sparse_map import map_adjustment
 from slamcli.sparse_map.sparse_map import SparseMap
@@ -31,7 +31,7 @@ def turn(n: int, start: float = 3.6, step: float = 0.05) -> np.ndarray:
 
 @cache
 def corner(n: int = 14) -> CoarseDepth:
-    return CoarseDepth(np.stack([icp.coarse(noisy(render(T, KINECT, FURNITURE), k)) for k, T in enumerate(turn(n))]))
+    return CoarseDepth(np.stack([icp.coarsen(noisy(render(T, KINECT, FURNITURE), k)) for k, T in enumerate(turn(n))]))
 
 
 def blind(n: int) -> tuple[Features, Words, Matches]:
@@ -79,10 +79,10 @@ def test_edges_survive_the_map_and_hold_it_in_the_adjustment_and_in_the_pose_gra
     result = map_adjustment.adjust(sparse_map, np.arange(len(good), dtype=np.int32), KINECT, SENSOR, max_iterations=30)
     assert result.cost[-1] < 0.05 * result.cost[0]
     assert np.abs(se3.log(sparse_map.kf.T_wk @ se3.inverse(good))).max() < 0.01
-    edges, support = loop_closing.covisibility_edges(sparse_map, LoopConfig())
+    edges, support = loop_pose_graph.covisibility_edges(sparse_map, LoopConfig())
     on_depth = {tuple(pair) for pair in map_.edge_kf.tolist()}
     assert on_depth <= {tuple(pair) for pair in edges.tolist()}
-    assert all(n >= loop_closing.SHAPE_SUPPORT for pair, n in zip(edges.tolist(), support, strict=True) if tuple(pair) in on_depth)
+    assert all(n >= loop_pose_graph.DEPTH_SUPPORT for pair, n in zip(edges.tolist(), support, strict=True) if tuple(pair) in on_depth)
 
 
 def test_same_input_same_bytes():
@@ -92,7 +92,7 @@ def test_same_input_same_bytes():
 
 def test_a_flat_wall_begins_no_map_and_its_reason_is_given():
     T = [look_along([0.5 + 0.02 * k, 0.05 * k, 0.0], 0.0, 0.0) for k in range(4)]
-    depth = CoarseDepth(np.stack([icp.coarse(noisy(render(t, KINECT, WALL, None), k)) for k, t in enumerate(T)]))
+    depth = CoarseDepth(np.stack([icp.coarsen(noisy(render(t, KINECT, WALL, None), k)) for k, t in enumerate(T)]))
     tracker = track(depth)
     assert (tracker.tracks().state == LOST).all() and len(tracker.map().kf_frame) == 0
     assert "no map yet" in tracker.lost_reason[0]
@@ -103,7 +103,7 @@ def past_a_box(n: int = 16) -> tuple[CoarseDepth, np.ndarray]:
     """Drive along a wall and a floor, past a box that is soon behind."""
     scene = (*WALL, ((-20.0, -20.0, -1.2), (20.0, 20.0, -1.0)), ((2.5, 0.8, -1.0), (3.0, 1.2, 0.3)))
     T = np.array([look_along([0.8, -0.07 * k, 0.0], 0.0, 0.3) for k in range(n)])
-    return CoarseDepth(np.stack([icp.coarse(noisy(render(t, KINECT, scene, None), k)) for k, t in enumerate(T)])), T
+    return CoarseDepth(np.stack([icp.coarsen(noisy(render(t, KINECT, scene, None), k)) for k, t in enumerate(T)])), T
 
 
 @pytest.mark.parametrize("hold", [0.0, 0.2, 1.0])
@@ -122,7 +122,7 @@ def test_along_a_flat_wall_the_motion_goes_on_for_a_while(hold):
 
 
 def test_another_place_is_not_taken_for_the_one_before():
-    wall = [icp.coarse(noisy(render(look_along([0.5, 0.0, 0.0], 0.0, 0.0), KINECT, WALL, None), 40 + k)) for k in range(4)]
+    wall = [icp.coarsen(noisy(render(look_along([0.5, 0.0, 0.0], 0.0, 0.0), KINECT, WALL, None), 40 + k)) for k in range(4)]
     tracker = track(CoarseDepth(np.concatenate([corner().coarse_depth[:4], np.stack(wall)])))
     state = tracker.tracks().state
     assert (state[:4] != LOST).all() and (state[4:] == LOST).all()
@@ -144,7 +144,7 @@ def test_key_frames_are_joined_only_where_they_show_the_same():
     for frame in (0, 2, 13):
         sparse_map.add_key_frame(frame, T_wc[frame])
     frame_points = FramePoints(depth, KINECT, SENSOR)
-    shape = Shape(sparse_map, frame_points, frame_points)
+    shape = DepthAligner(sparse_map, frame_points, frame_points)
     assert shape.join_pair(1, 0)
     e = se3.log(sparse_map.edge.T_ij[0] @ se3.inverse(T_wc[0]) @ T_wc[2])
     assert np.linalg.norm(e) < 0.006
@@ -159,7 +159,7 @@ def test_edges_hold_for_the_instants_of_the_colour_images():
     for kf, frame in enumerate((0, 2)):
         sparse_map.add_key_frame(frame, T_wd[frame] @ se3.inverse(T_cd[kf]))
     frame_points = FramePoints(corner(), KINECT, SENSOR)
-    assert Shape(sparse_map, frame_points, frame_points).join_pair(1, 0, T_cd)
+    assert DepthAligner(sparse_map, frame_points, frame_points).join_pair(1, 0, T_cd)
     e = se3.log(sparse_map.edge.T_ij[0] @ se3.inverse(sparse_map.kf.T_wk[0]) @ sparse_map.kf.T_wk[1])
     assert np.linalg.norm(e) < 0.006
 
@@ -216,7 +216,9 @@ def test_key_frames_are_joined_the_same_with_any_number_of_threads():
     for workers in (1, 3):
         sparse_map = revisit(frames)
         assert (
-            Shape(sparse_map, frame_points, frame_points).join_covisible(np.tile(np.eye(4), (4, 1, 1)), most=6, least=30, workers=workers)
+            DepthAligner(sparse_map, frame_points, frame_points).join_covisible(
+                np.tile(np.eye(4), (4, 1, 1)), most=6, least=30, workers=workers
+            )
             == 6
         )
         found.append(sparse_map.edge)

@@ -1,4 +1,4 @@
-"""Loops: true revisits are found and pull drift out, look-alikes and unverifiable ones are rejected with a reason; hindsight."""
+"""Loops: true revisits are found and pull drift out, look-alikes and unverifiable ones are rejected with a reason; final refinement."""
 
 from dataclasses import replace
 
@@ -9,10 +9,11 @@ from scenes import CAMERA, ape, observe, orbit, room_points
 from slamcli.config.options import LoopConfig, SensorConfig, TrackConfig
 from slamcli.geometry import se3
 from slamcli.schema import LOST, frame_poses
-from slamcli.slam import final_refinement, loop_closing
+from slamcli.slam import final_refinement, loop_candidates, loop_pose_graph, loop_verification
+from slamcli.slam.loop_candidates import Candidate, Claims
+from slamcli.slam.loop_closing import LoopCloser
 from slamcli.slam.place_recognition import PlaceIndex
 from slamcli.slam.tracker import Tracker
-from slamcli.sparse_map import map_adjustment
 from slamcli.sparse_map.sparse_map import SparseMap
 
 SENSOR, SETTINGS = SensorConfig(pixel_noise=0.5), LoopConfig()
@@ -37,15 +38,15 @@ def drifted(scene, map_, per_key_frame: np.ndarray) -> SparseMap:
     for k in range(1, len(T_wk)):
         step = se3.inverse(map_.T_wk[k - 1]) @ map_.T_wk[k] @ se3.exp(per_key_frame)
         T_wk[k] = T_wk[k - 1] @ step
-    loop_closing.apply(sparse_map, T_wk)
+    loop_pose_graph.move(sparse_map, T_wk)
     return sparse_map
 
 
-def verified(scene, sparse_map) -> list[loop_closing.Candidate]:
+def verified(scene, sparse_map) -> list[Candidate]:
     places = PlaceIndex(scene.words, sparse_map.kf.frame)
     rng = np.random.default_rng(1)
-    candidates = loop_closing.find_candidates(sparse_map, places, SETTINGS)
-    return [loop_closing.verify(sparse_map, scene.words, c, CAMERA, SETTINGS, SENSOR, rng) for c in candidates]
+    candidates = loop_candidates.find_alike(sparse_map, places, SETTINGS)
+    return [loop_verification.verify(sparse_map, scene.words, c, CAMERA, SETTINGS, SENSOR, rng) for c in candidates]
 
 
 def test_similarity_is_symmetric_and_one_for_itself(turn):
@@ -72,13 +73,12 @@ def test_closing_takes_the_drift_out(turn):
     sparse_map = drifted(scene, map_, np.array([0.003, 0.001, 0.0, 0.0, 0.001, 0.0]))
     true = scene.T_gc[map_.kf_frame]
     before = ape(sparse_map.kf.T_wk, true)
-    accepted = [c for c in verified(scene, sparse_map) if c.is_accepted]
-    graph = loop_closing.close(sparse_map, accepted, SETTINGS)
-    loop_closing.apply(sparse_map, graph.T_wk)
-    fused = sum(loop_closing.fuse_around(sparse_map, c, CAMERA, SETTINGS, SENSOR) for c in accepted)
-    map_adjustment.adjust(sparse_map, np.arange(len(sparse_map.kf), dtype=np.int32), CAMERA, SENSOR, max_iterations=30)
+    n_landmarks = int(sparse_map.lm.is_alive.sum())
+    closer = LoopCloser(sparse_map, scene.words, CAMERA, SETTINGS, SENSOR, np.random.default_rng(1), progress=lambda items, *_: items)
+    tried = closer.close_loops()
     after = ape(sparse_map.kf.T_wk, true)
-    assert fused > 50
+    assert any(c.is_accepted for c in tried) and [(c.kf_i, c.kf_j) for c in tried] == sorted(closer.fate)
+    assert 50 < n_landmarks - sparse_map.lm.is_alive.sum() < 0.5 * n_landmarks, "what both sides see is one landmark now"
     assert before > 0.02 and 1e-4 < after < before / 3
 
 
@@ -88,7 +88,7 @@ def test_a_lone_true_closure_outlasts_a_drift_of_five_degrees(turn):
     far = [c for c in verified(scene, sparse_map) if c.is_accepted and c.kf_i - c.kf_j > len(sparse_map.kf) // 2][:1]
     T_ij = se3.inverse(sparse_map.kf.T_wk[far[0].kf_i]) @ sparse_map.kf.T_wk[far[0].kf_j]
     assert 4.0 < np.degrees(np.linalg.norm(se3.log(T_ij @ se3.inverse(far[0].T_ij))[3:])) < 7.0
-    graph = loop_closing.close(sparse_map, far, SETTINGS)
+    graph = loop_pose_graph.solve(sparse_map, far, SETTINGS)
     true = scene.T_gc[map_.kf_frame]
     assert graph.is_kept.all() and ape(graph.T_wk, true) < 0.8 * ape(sparse_map.kf.T_wk, true)
 
@@ -98,8 +98,8 @@ def test_a_planted_false_closure_is_dropped(turn):
     sparse_map = SparseMap.from_map(scene.features, map_)
     accepted = [c for c in verified(scene, sparse_map) if c.is_accepted]
     n = len(sparse_map.kf)
-    false = loop_closing.Candidate(n // 2, 2, 0.4, 100, 200, T_ij=se3.exp(np.array([0.4, 0.1, 0.2, 0.0, 0.3, 0.0])))
-    honest, fooled = loop_closing.close(sparse_map, accepted, SETTINGS), loop_closing.close(sparse_map, [*accepted, false], SETTINGS)
+    false = Candidate(n // 2, 2, 0.4, 100, 200, T_ij=se3.exp(np.array([0.4, 0.1, 0.2, 0.0, 0.3, 0.0])))
+    honest, fooled = loop_pose_graph.solve(sparse_map, accepted, SETTINGS), loop_pose_graph.solve(sparse_map, [*accepted, false], SETTINGS)
     assert not fooled.is_kept[-1]
     true = scene.T_gc[map_.kf_frame]
     assert ape(fooled.T_wk, true) < 1.1 * ape(honest.T_wk, true)
@@ -108,13 +108,13 @@ def test_a_planted_false_closure_is_dropped(turn):
 def test_rejected_candidates_say_why(turn):
     scene, _, map_ = turn
     sparse_map = SparseMap.from_map(scene.features, map_)
-    strangers = loop_closing.Candidate(len(sparse_map.kf) // 2, 0, 0.9)
+    strangers = Candidate(len(sparse_map.kf) // 2, 0, 0.9)
     rng = np.random.default_rng(2)
-    fate = loop_closing.verify(sparse_map, scene.words, strangers, CAMERA, SETTINGS, SENSOR, rng)
+    fate = loop_verification.verify(sparse_map, scene.words, strangers, CAMERA, SETTINGS, SENSOR, rng)
     assert not fate.is_accepted and "of 20 matches" in fate.reason
 
 
-def test_hindsight_finds_lost_frames_and_keeps_the_rest(turn):
+def test_final_refinement_finds_lost_frames_and_keeps_the_rest(turn):
     scene, tracks, map_ = turn
     tracks = replace(tracks, **{name: getattr(tracks, name).copy() for name in ("state", "ref_kf", "T_kc")})
     tracks.state[40:44], tracks.ref_kf[40:44], tracks.T_kc[40:44] = LOST, -1, np.nan
@@ -125,7 +125,7 @@ def test_hindsight_finds_lost_frames_and_keeps_the_rest(turn):
     assert 1e-4 < error[1] < error[0] + 0.001
 
 
-def test_hindsight_finds_the_same_with_any_number_of_threads(turn):
+def test_final_refinement_finds_the_same_with_any_number_of_threads(turn):
     scene, tracks, map_ = turn
     found = []
     for workers in (1, 2, 4):
@@ -138,7 +138,7 @@ def test_hindsight_finds_the_same_with_any_number_of_threads(turn):
             np.testing.assert_array_equal(getattr(other, name), getattr(found[0], name))
 
 
-def test_hindsight_matches_key_frames_again_and_the_world_stays_where_it_is(turn):
+def test_final_refinement_matches_key_frames_again_and_the_world_stays_where_it_is(turn):
     scene, tracks, map_ = turn
     sparse_map = SparseMap.from_map(scene.features, map_)
     rng = np.random.default_rng(5)
@@ -160,7 +160,7 @@ def test_hindsight_matches_key_frames_again_and_the_world_stays_where_it_is(turn
     assert error[0] > 0.01 and 1e-5 < error[1] < 0.2 * error[0]
 
 
-def test_a_key_frame_that_shape_held_keeps_its_pose(turn):
+def test_a_key_frame_that_depth_held_keeps_its_pose(turn):
     scene, tracks, map_ = turn
     most = int(tracks.n_inliers.max())
     found = [
@@ -180,12 +180,12 @@ def test_views_of_one_spot_are_found_by_their_poses(turn):
     true = scene.T_gc[map_.kf_frame]
     sparse_map = drifted(scene, map_, np.array([0.001, 0.0, 0.0, 0.0, 0.0003, 0.0]))
     places = PlaceIndex(scene.words, sparse_map.kf.frame)
-    near = loop_closing.find_near(sparse_map, places, SETTINGS)
-    spot = sparse_map.kf.T_wk[:, :3, 3] + loop_closing.AHEAD * sparse_map.kf.T_wk[:, :3, 2]
+    near = loop_candidates.find_by_pose(sparse_map, places, SETTINGS)
+    spot = sparse_map.kf.T_wk[:, :3, 3] + loop_candidates.AHEAD * sparse_map.kf.T_wk[:, :3, 2]
     for c in near:
-        assert c.is_near and c.kf_j < c.kf_i and np.linalg.norm(spot[c.kf_i] - spot[c.kf_j]) < SETTINGS.near
+        assert c.is_by_pose and c.kf_j < c.kf_i and np.linalg.norm(spot[c.kf_i] - spot[c.kf_j]) < SETTINGS.near
         assert sparse_map.votes(sparse_map.landmarks_of(c.kf_i))[c.kf_j] < SETTINGS.min_shared
-    fate = [loop_closing.verify(sparse_map, scene.words, c, CAMERA, SETTINGS, SENSOR, np.random.default_rng(0)) for c in near]
+    fate = [loop_verification.verify(sparse_map, scene.words, c, CAMERA, SETTINGS, SENSOR, np.random.default_rng(0)) for c in near]
     accepted = [c for c in fate if c.is_accepted]
     assert any(c.kf_i > 0.9 * len(true) and c.kf_j < 0.15 * len(true) for c in accepted)
     for c in accepted:
@@ -193,25 +193,25 @@ def test_views_of_one_spot_are_found_by_their_poses(turn):
         assert np.linalg.norm(error[:3]) < 0.05 and np.linalg.norm(error[3:]) < 0.02
     sparse_map.kf.segment[len(true) // 2 :] = 1
     half = len(true) // 2
-    assert all((c.kf_i < half) == (c.kf_j < half) for c in loop_closing.find_near(sparse_map, places, SETTINGS))
+    assert all((c.kf_i < half) == (c.kf_j < half) for c in loop_candidates.find_by_pose(sparse_map, places, SETTINGS))
 
 
 def test_no_spot_is_near_at_a_reach_of_zero(turn):
     scene, _, map_ = turn
     sparse_map = SparseMap.from_map(scene.features, map_)
-    assert loop_closing.find_near(sparse_map, PlaceIndex(scene.words, sparse_map.kf.frame), LoopConfig(near=0.0)) == []
+    assert loop_candidates.find_by_pose(sparse_map, PlaceIndex(scene.words, sparse_map.kf.frame), LoopConfig(near=0.0)) == []
 
 
 @pytest.mark.parametrize("span", [0, 3, 10])
 def test_claims_cover_what_is_near_any_of_them(span):
     rng = np.random.default_rng(span)
-    pairs = [loop_closing.Candidate(int(i), int(j), 0.5) for i, j in rng.integers(0, 60, (150, 2))]
-    claims, kept = loop_closing.Claims(pairs[:10], span=span), pairs[:10]
+    pairs = [Candidate(int(i), int(j), 0.5) for i, j in rng.integers(0, 60, (150, 2))]
+    claims, kept = Claims(pairs[:10], span=span), pairs[:10]
     for c in pairs[10:]:
-        is_near = any(loop_closing.is_near(c, other, span=span) for other in kept)
+        is_near = any(loop_candidates.is_same_revisit(c, other, span=span) for other in kept)
         assert claims.cover(c) == is_near
         if not is_near:
             claims.add(c)
             kept.append(c)
     assert 10 < len(kept) <= len(pairs)
-    assert loop_closing.spread(pairs[10:], span=span)[0] is pairs[10]
+    assert loop_candidates.first_of_each_revisit(pairs[10:], span=span)[0] is pairs[10]

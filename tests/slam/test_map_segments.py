@@ -13,7 +13,7 @@ from slamcli.formats.trajectory import read_tum
 from slamcli.geometry import se3
 from slamcli.schema import LOST, RELOCALIZED, Map, Tracks, frame_poses, frame_segments, trajectory
 from slamcli.slam import map_merging, map_segments
-from slamcli.slam.loop_closing import Candidate
+from slamcli.slam.loop_candidates import Candidate
 from slamcli.sparse_map import map_adjustment
 from slamcli.sparse_map.sparse_map import SparseMap
 from slamcli.stages import loop, optimize, track

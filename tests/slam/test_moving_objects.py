@@ -38,7 +38,7 @@ def recording(who: str) -> tuple[Views, np.ndarray]:
         boxes = {"nobody": (), "walking": (walker(i),), "standing": (walker(12),), "leaving": (walker(14),) if i < 18 else ()}[who]
         T_lc = camera_at(0 if who == "leaving" else i)
         seen, empty = render(T_lc, KINECT, boxes=(*FURNITURE, *boxes)), render(T_lc, KINECT)
-        depth.append(icp.coarse(seen))
+        depth.append(icp.coarsen(seen))
         masks.append((seen < empty - 1e-3)[STEP // 2 :: STEP, STEP // 2 :: STEP])
     T_wc = np.array([camera_at(0 if who == "leaving" else i) for i in range(FRAMES)])
     return Views(np.array(depth), np.arange(FRAMES) / RATE, T_wc, np.zeros(FRAMES, dtype=np.int64), KINECT), np.array(masks)
@@ -130,7 +130,7 @@ def test_the_motion_of_the_room_is_found_where_somebody_walks_along() -> None:
 
 def test_the_room_speaks_for_its_own_motion_by_its_extent() -> None:
     views, _ = recording("walking")
-    source, target = (icp.relief(views.depth[i], KINECT, SensorConfig()) for i in (10, 16))
+    source, target = (icp.surface_points(views.depth[i], KINECT, SensorConfig()) for i in (10, 16))
     true, followed = se3.inverse(views.T_wc[16]) @ views.T_wc[10], np.eye(4)
 
     def explain(T: np.ndarray) -> tuple[float, float]:
