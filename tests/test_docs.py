@@ -1,5 +1,6 @@
 """What the documents tell a user to type and to write is what the program takes."""
 
+import ast
 import re
 import shlex
 import tomllib
@@ -16,6 +17,7 @@ ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 BLOCK, COMMAND = re.compile(r"^ *```\w*\n(.*?)^ *```", re.M | re.S), re.compile(r"^\s*(?:\$ )?(slamcli [^\n]*)$", re.M)
 INLINE = re.compile(r"`(slamcli [^`]*)`")
+PLACE = re.compile(r"(?<![\w/])(?:slamcli/)?((?:[a-z_0-9]+/)+[a-z_0-9]+)\.([A-Za-z_]\w*)(?:\.(\w+))?")
 
 
 def commands(page: Path) -> list[str]:
@@ -51,3 +53,28 @@ def test_the_camera_file_in_the_documents_is_whole_and_right() -> None:
     text = re.search(r"```toml\n(.*?)```", (ROOT / "docs" / "robot.md").read_text(encoding="utf-8"), re.S).group(1)
     camera = Camera.from_dict(tomllib.loads("\n".join(line.strip() for line in text.splitlines())), source="docs/robot.md")
     assert (camera.width, camera.height, camera.depth_scale) == (640, 480, 1000.0)
+
+
+def names_in(body: list[ast.stmt]) -> dict[str, ast.stmt]:
+    return {node.name: node for node in body if isinstance(node, ast.FunctionDef | ast.ClassDef)}
+
+
+def places(page: Path) -> list[tuple[str, str, str]]:
+    """Return each file of the package that a page names, what it names in it, and what within that."""
+    found = PLACE.findall(page.read_text(encoding="utf-8"))
+    return [place for place in found if (ROOT / "slamcli" / place[0].split("/")[0]).is_dir()]
+
+
+def test_the_method_names_functions_enough_to_follow_it() -> None:
+    assert len({place for place in places(ROOT / "docs" / "method.md") if place[1] != "py"}) > 50
+
+
+@pytest.mark.parametrize("page", [*PAGES, ROOT / "CONTRIBUTING.md"], ids=lambda page: page.name)
+def test_every_file_and_function_that_the_documents_name_is_there(page: Path) -> None:
+    for name, what, within in places(page):
+        file = ROOT / "slamcli" / f"{name}.{what if what in ('css', 'html', 'js', 'toml') else 'py'}"
+        assert file.is_file(), f"{page.name}: {file}"
+        if file.suffix == ".py" and what != "py":
+            there = names_in(ast.parse(file.read_text(encoding="utf-8")).body)
+            assert what in there, f"{page.name}: {name}.{what}"
+            assert not within or within in names_in(there[what].body), f"{page.name}: {name}.{what}.{within}"
