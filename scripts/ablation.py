@@ -36,7 +36,7 @@ LEVERS = {  # how each is turned, and what it is
     "optimize.readout=false": "rolling shutter",
     "optimize.depth_icp_edges=0": "depth images of key frames aligned with each other",
     "loop.enabled=false": "loop closing",
-    "loop.final_refinement=false": "second look at every frame after loops are closed",
+    "loop.final_refinement=false": "final refinement after loops are closed",
     "optimize.intrinsics=true": "intrinsics found as well, where the calibration is good",
     "optimize.depth_scale=true": "scale and offset of depth found as well",
 }

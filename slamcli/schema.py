@@ -1,6 +1,7 @@
 """The core types. Each is a frozen record of arrays and, saved as a folder of `.npy`, also an artefact's schema.
 
 F frames, V x U coarse pixels, M features, P pairs, Q matches, W words, B word-vector entries, K key frames, L landmarks, O observations, E edges, C closures.
+v x u blocks of a view, H x W cells of the grid, N poses of a trajectory.
 Missing values: depth and pose NaN, index -1. `offset` columns delimit ragged rows: those of frame i are offset[i]:offset[i+1].
 """
 
@@ -42,7 +43,7 @@ class Features:
 
 @dataclass(frozen=True)
 class CoarseDepth:
-    """What of the depth images suffices to align shapes, by extract: places without texture are tracked on it."""
+    """Coarse depth images, by extract: enough to align shapes, on which places without texture are tracked."""
 
     coarse_depth: np.ndarray = array("u2", "F V U", "2e-4 m along the optical axis, of the middle of a block of pixels, 0 = none")
 
@@ -85,7 +86,7 @@ LOST, TRACKED, KEY_FRAME, RELOCALIZED, ON_DEPTH = range(5)  # values of Tracks.s
 
 @dataclass(frozen=True)
 class Tracks:
-    """Each frame's pose relative to a key frame, by track and, refined with hindsight, by loop; map updates move the frames along."""
+    """Each frame's pose relative to a key frame, by track and, refined against the final map, by loop; map updates move the frames along."""
 
     ref_kf: np.ndarray = array("i4", "F", "row in Map of the key frame a frame hangs on, -1 = lost")
     T_kc: np.ndarray = array("f8", "F 4 4", "frame's camera to that key frame's camera, NaN = lost")

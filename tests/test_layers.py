@@ -14,9 +14,9 @@ import slamcli
 PACKAGE = Path(slamcli.__file__).parent
 MODULES = sorted(PACKAGE.rglob("*.py"))
 
-# The rooms of the house from the ground up. A file imports only from lower floors, and from its own room; rooms on one floor do not
-# know each other. Files in the package's root are rooms of their own.
-FLOORS = (
+# The layers from the ground up. A file imports only from lower layers, and from its own package; packages of one layer do not know
+# each other. Files in the root count as packages of their own.
+LAYERS = (
     ("errors", "data"),
     ("__init__", "user_cache"),
     ("files", "interruption"),
@@ -40,9 +40,9 @@ FLOORS = (
     ("cli",),
     ("__main__",),
 )
-FLOOR_OF = {room: floor for floor, rooms in enumerate(FLOORS) for room in rooms}
+LAYER_OF = {package: layer for layer, packages in enumerate(LAYERS) for package in packages}
 CLICK = ("cli",)
-# Rooms of pure numerics: they open no file, and their errors are for a notebook as much as for the command line.
+# Packages of pure numerics: they open no file, and their errors are for a notebook as much as for the command line.
 NUMERICAL = ("geometry", "vision", "depth", "estimation", "sparse_map", "dense", "navigation", "calibration", "slam")
 FILES = ("slamcli.files", "pathlib", "io", "os", "shutil", "tempfile", "zipfile")
 COMMAND_LINE = re.compile(r"slamcli [a-z]|(^|\s)--?[a-z]")
@@ -54,7 +54,7 @@ def name_of(path: Path) -> str:
     return path.relative_to(PACKAGE).as_posix()
 
 
-def layer_of(path: Path) -> str:
+def package_of(path: Path) -> str:
     return name_of(path).split("/")[0].removesuffix(".py")
 
 
@@ -77,22 +77,22 @@ def parsed(path: Path) -> ast.Module:
     return ast.parse(path.read_text(encoding="utf-8"))
 
 
-def rooms_used(path: Path) -> set[str]:
-    """Return the rooms that a file imports from."""
+def packages_used(path: Path) -> set[str]:
+    """Return the packages that a file imports from."""
     used = {name.split(".")[1] for name, _ in imports(parsed(path)) if name.startswith("slamcli.")}
-    return {room if room in FLOOR_OF else "__init__" for room in used} - {layer_of(path)}
+    return {name if name in LAYER_OF else "__init__" for name in used} - {package_of(path)}
 
 
 @pytest.mark.parametrize("path", MODULES, ids=name_of)
-def test_each_file_belongs_to_a_room_and_imports_only_from_floors_below(path: Path) -> None:
-    room = layer_of(path)
-    assert room in FLOOR_OF, f"{name_of(path)} is under no rule: give its room a floor"
-    upward = {used for used in rooms_used(path) if FLOOR_OF[used] >= FLOOR_OF[room]}
+def test_each_file_belongs_to_a_package_and_imports_only_from_layers_below(path: Path) -> None:
+    package = package_of(path)
+    assert package in LAYER_OF, f"{name_of(path)} is under no rule: give its package a layer"
+    upward = {used for used in packages_used(path) if LAYER_OF[used] >= LAYER_OF[package]}
     assert not upward, f"{name_of(path)} must not import from {sorted(upward)}"
 
 
-def test_every_room_of_the_plan_is_there() -> None:
-    assert {layer_of(path) for path in MODULES} | {"data"} == set(FLOOR_OF)
+def test_every_package_of_the_plan_is_there() -> None:
+    assert {package_of(path) for path in MODULES} | {"data"} == set(LAYER_OF)
 
 
 @pytest.mark.parametrize("path", MODULES, ids=name_of)
@@ -111,8 +111,8 @@ def test_heavy_and_interactive_packages_stay_where_they_belong(path: Path) -> No
             assert package in {*sys.stdlib_module_names, "click", "slamcli", "__future__"}, f"{here} imports {package} at its top"
 
 
-@pytest.mark.parametrize("path", [path for path in MODULES if layer_of(path) in NUMERICAL], ids=name_of)
-def test_numerical_rooms_open_no_file_and_speak_no_command_line(path: Path) -> None:
+@pytest.mark.parametrize("path", [path for path in MODULES if package_of(path) in NUMERICAL], ids=name_of)
+def test_numerical_packages_open_no_file_and_speak_no_command_line(path: Path) -> None:
     tree = parsed(path)
     opened = {name for name, _ in imports(tree) if name in FILES}
     assert not opened, f"{name_of(path)} imports {sorted(opened)}: files belong to formats/, datasets/ and stages/"
@@ -145,9 +145,9 @@ def test_a_kernel_calls_only_kernels_of_its_own_file_or_of_geometry(path: Path) 
         for node in ast.walk(tree)
         if isinstance(node, ast.ImportFrom) and str(node.module).startswith("slamcli")
         for alias in node.names
-        if not f"{node.module}.{alias.name}".startswith("slamcli.geometry.") or layer_of(path) == "geometry"
+        if not f"{node.module}.{alias.name}".startswith("slamcli.geometry.") or package_of(path) == "geometry"
     }
-    if layer_of(path) == "geometry":
+    if package_of(path) == "geometry":
         foreign = {}
     plain = {node.name for node in tree.body if isinstance(node, ast.FunctionDef) and not is_kernel(node) and not is_instruction(node)}
     for function in (node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef) and is_kernel(node)):

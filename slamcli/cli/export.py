@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from slamcli.cli.common import Target, check_ending, json_option, mount_option, run_option
+from slamcli.formats import TRAJECTORY_FORMATS
 
 if TYPE_CHECKING:
     import numpy as np
@@ -18,9 +19,7 @@ if TYPE_CHECKING:
     from slamcli.runs.run_directory import RunDir
 
 CLOUD = "sparse_pc.ply"  # the name under which nerfstudio's own converters write it
-
-
-LAYOUT_OF = {".txt": "tum", ".tum": "tum", ".kitti": "kitti", ".csv": "csv"}
+LAYOUT_OF = {ending: layout for layout, endings in TRAJECTORY_FORMATS.items() for ending in endings}
 
 
 @click.command("export-trajectory")
@@ -29,7 +28,7 @@ LAYOUT_OF = {".txt": "tum", ".tum": "tum", ".kitti": "kitti", ".csv": "csv"}
 @click.option("--stage", type=click.Choice(["track", "optimize", "loop"]), help="Whose trajectory; default: the last there is.")
 @click.option("--frame", type=click.Choice(["world", "level"]), default="world", show_default=True, help="level: z up, floor at z = 0.")
 @click.option(
-    "--format", "layout", type=click.Choice(["tum", "kitti", "csv"]), help="[default: by OUT's ending]; kitti has no time stamps."
+    "--format", "layout", type=click.Choice(list(TRAJECTORY_FORMATS)), help="[default: by OUT's ending]; kitti has no time stamps."
 )
 @click.option("--sure-only", is_flag=True, help="Leave out the poses that the run itself doubts; of the final trajectory.")
 @mount_option
@@ -54,7 +53,7 @@ def export_trajectory(
       slamcli export-trajectory base.txt --frame level --mount 0.1,0,0.3,0,0.2,0
     """
     from slamcli.evaluation import trajectory_error
-    from slamcli.formats.trajectory import WRITERS
+    from slamcli.formats import trajectory as trajectory_file
     from slamcli.navigation.robot_pose import base_in_camera
     from slamcli.runs.run_directory import RunDir
     from slamcli.schema import Ground, Trajectory
@@ -76,7 +75,7 @@ def export_trajectory(
         T_wc = ground.T_lw @ T_wc
     if mount is not None:
         T_wc = T_wc @ base_in_camera(mount)
-    WRITERS[layout](out, Trajectory(stamp=trajectory.stamp, T_wc=T_wc))
+    trajectory_file.writer(layout)(out, Trajectory(stamp=trajectory.stamp, T_wc=T_wc))
     n_frames = trajectory_error.frame_count(folder)
     if as_json:
         click.echo(json.dumps({"out": str(out), "poses": len(trajectory.stamp), "frames": n_frames, "frame": frame, "format": layout}))

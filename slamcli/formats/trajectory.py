@@ -5,6 +5,7 @@ KITTI, one pose a line: the upper 3 x 4 of the camera-to-world matrix row by row
 CSV: a line of names, then the columns of TUM with commas between them.
 """
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -56,6 +57,12 @@ def write_kitti(path: str | Path, trajectory: Trajectory) -> None:
     files.write_text(path, "".join(" ".join(f"{value:.9e}" for value in row) + "\n" for row in rows))
 
 
+def writer(layout: str) -> Callable[[str | Path, Trajectory], None]:
+    """Return the function that writes one of `TRAJECTORY_FORMATS`."""
+    write: Callable[[str | Path, Trajectory], None] = globals()[f"write_{layout}"]
+    return write
+
+
 def _data_lines(path: Path) -> list[tuple[int, str]]:
     """Return (line number, text) of the lines that hold data."""
     try:
@@ -81,6 +88,3 @@ def _parse(path: Path, number: int, line: str) -> list[float]:
     if max(abs(x) for x in row[:4]) > FARTHEST:
         raise SlamError(f"{path}:{number}: {line.strip()[:80]!r} holds a stamp or a place that no camera can have")
     return row
-
-
-WRITERS = {"tum": write_tum, "kitti": write_kitti, "csv": write_csv}

@@ -1,4 +1,4 @@
-"""What a stage is given: its inputs, its settings, and tools. A stage is `run(inputs, out, cfg, tools) -> summary` and knows no more of a run."""
+"""What a stage is, and what it is given: its inputs, a folder, its settings, and tools. It knows no more of a run."""
 
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -6,6 +6,7 @@ from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
+from slamcli.config.options import Config
 from slamcli.datasets import Dataset
 from slamcli.geometry.camera import Camera
 
@@ -48,3 +49,16 @@ class Tools(Protocol):
 
     def rng(self) -> np.random.Generator:
         """Return the stage's own random numbers: the same for the same seed, whatever ran before."""
+
+
+class Run(Protocol):
+    """The function `run` of a stage's file: load the inputs, call the numerical packages, save what they return."""
+
+    def __call__(self, inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
+        """Write the stage's files into the empty folder `out` and return what there is to count.
+
+        inputs : what the stage's row of `STAGES` declares in `needs`; anything else is an error
+        out : takes the place of the stage's folder when this returns, and is dropped when it raises
+        cfg : the seed, and of the sections those that the row declares in `config`; any other is an error, as a change in it would go unnoticed
+        Raises SlamError for what a user can mend.
+        """

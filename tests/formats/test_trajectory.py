@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from slamcli.errors import SlamError
-from slamcli.formats.trajectory import read_tum, write_kitti, write_tum
+from slamcli.formats import TRAJECTORY_FORMATS
+from slamcli.formats.trajectory import read_tum, write_kitti, write_tum, writer
 from slamcli.geometry import se3
 from slamcli.schema import Trajectory
 
@@ -93,3 +94,12 @@ def test_evo_reads_the_same_poses(tmp_path: Path) -> None:
     kitti = file_interface.read_kitti_poses_file(str(tmp_path / "k.txt"))
     np.testing.assert_allclose(np.array(tum.poses_se3), trajectory.T_wc, atol=1e-8)
     np.testing.assert_allclose(np.array(kitti.poses_se3), trajectory.T_wc, atol=1e-8)
+
+
+@pytest.mark.parametrize("layout", TRAJECTORY_FORMATS)
+def test_every_format_of_the_table_has_its_writer_and_its_own_endings(layout: str, tmp_path: Path) -> None:
+    writer(layout)(tmp_path / "t", random_trajectory(4, 0))
+    lines = (tmp_path / "t").read_text().splitlines()
+    assert 4 <= len(lines) <= 5  # a line of names at most
+    others = [ending for name, endings in TRAJECTORY_FORMATS.items() if name != layout for ending in endings]
+    assert TRAJECTORY_FORMATS[layout] and not set(TRAJECTORY_FORMATS[layout]) & {*others, ".g2o"}
