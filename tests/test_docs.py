@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+import slamcli
 from slamcli.cli.main import cli
 from slamcli.config import toml
 from slamcli.config.options import Config
@@ -78,3 +79,14 @@ def test_every_file_and_function_that_the_documents_name_is_there(page: Path) ->
             there = names_in(ast.parse(file.read_text(encoding="utf-8")).body)
             assert what in there, f"{page.name}: {name}.{what}"
             assert not within or within in names_in(there[what].body), f"{page.name}: {name}.{what}.{within}"
+
+
+def test_the_glossary_explains_every_count_of_every_stage(room_run: Path) -> None:
+    explained: dict[str, set[str]] = {}
+    stage = ""
+    for row in re.findall(r"^\| (\w*) ?\| ([^|]+) \|", (ROOT / "docs" / "glossary.md").read_text(encoding="utf-8"), re.M):
+        stage = row[0] or stage
+        explained.setdefault(stage, set()).update(row[1].split(", "))
+    for name, summary in slamcli.open_run(room_run).summary().items():
+        counted = {count.replace("_", " ") for count in summary} - {"frames"}
+        assert counted <= explained[name], f"{name}: {sorted(counted - explained[name])}"

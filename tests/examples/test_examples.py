@@ -3,15 +3,21 @@
 import importlib.util
 import json
 import os
+import re
 import runpy
 import subprocess
 import sys
+from dataclasses import fields
 from pathlib import Path
 
 import pytest
 
 from slamcli.datasets import silent
 from slamcli.datasets.simulate import simulate
+from slamcli.depth.icp import Alignment
+from slamcli.estimation.bundle_adjustment import BundleResult
+from slamcli.geometry.octree import Octree
+from slamcli.schema import Map, Tracks
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 EXECUTE = """
@@ -75,3 +81,16 @@ def test_the_notebook_runs(here: Path, room: Path) -> None:
     assert done.returncode == 0, done.stderr
     assert "grid2d" in done.stdout
     assert (here / "runs" / "tour" / "report.html").is_file()
+
+
+def test_the_parts_work_without_the_pipeline_and_print_each_field(play, room: Path) -> None:
+    printed = play("parts.py", room)
+    assert "40 of 40 frames tracked" in printed
+    overlap = float(re.search(r"overlap +(\d+)%", printed)[1])
+    before, after = (float(value) for value in re.search(r"is ([\d.]+) mm off before, ([\d.]+) mm after", printed).groups())
+    assert 50.0 < overlap <= 100.0
+    assert before == 20.0 and after < 5.0
+    results = (Tracks, Map, Alignment, Octree, BundleResult)
+    said = {name for line in printed.splitlines() if line.startswith("  ") for name in line[2:26].replace(",", " ").split()}
+    left_out = {"kf_segment", "edge_kf", "edge_T_ij", "edge_information", "resolution", "key"}
+    assert {field.name for result in results for field in fields(result)} - said <= left_out
