@@ -22,7 +22,6 @@ from lab_measure import Reading, measure, outlines, table_2
 
 import slamcli
 from slamcli import console
-from slamcli.cli.grid import camera_path
 from slamcli.datasets.simulate import simulate
 from slamcli.errors import SlamError
 from slamcli.evaluation import grid_truth
@@ -30,6 +29,7 @@ from slamcli.evaluation.grid_truth import Scene
 from slamcli.geometry import se3
 from slamcli.navigation import grid as grid_module
 from slamcli.navigation import planner
+from slamcli.runs.placement import camera_path
 from slamcli.runs.run_directory import RunDir
 from slamcli.schema import Features, Grid, Ground, Map, Tracks, frame_poses
 from slamcli.visualization.grid_picture import draw

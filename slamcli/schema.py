@@ -173,10 +173,10 @@ class Ground:
 
 @dataclass(frozen=True)
 class Grid:
-    """The 2-D grid before the decision rule, by grid2d. Row 0 is the smallest y, column 0 the smallest x."""
+    """The 2-D grid and what it was decided by, from grid2d. Row 0 is the smallest y, column 0 the smallest x."""
 
     p_occupied: np.ndarray = array("f4", "H W", "P(F), NaN where never seen")
-    n_seen: np.ndarray = array("i4", "H W", "key frames that saw the cell")
+    n_seen: np.ndarray = array("i4", "H W", "frames read that saw the cell")
     state: np.ndarray = array("i1", "H W", "1 occupied, 0 free, -1 unknown; [L] (24)")
     origin: np.ndarray = array("f8", "2", "m, level frame: x, y of the outer corner of cell (0, 0)")
     resolution: np.ndarray = array("f8", "", "m, side of a cell")
@@ -201,6 +201,13 @@ def frame_poses(tracks: Tracks, map_: Map, segment: int = 0) -> np.ndarray:
     is_here = frame_segments(tracks, map_) == segment
     T_wc[is_here] = map_.T_wk[tracks.ref_kf[is_here]] @ tracks.T_kc[is_here]
     return T_wc
+
+
+def poses_in_segments(tracks: Tracks, map_: Map) -> tuple[np.ndarray, np.ndarray]:
+    """Return the map segment (F,) of every frame, -1 where it is lost, and T_wc (F, 4, 4) in the world of that segment, NaN where lost."""
+    T_wc, has_pose = np.full((len(tracks.ref_kf), 4, 4), np.nan), tracks.ref_kf >= 0
+    T_wc[has_pose] = map_.T_wk[tracks.ref_kf[has_pose]] @ tracks.T_kc[has_pose]
+    return frame_segments(tracks, map_), T_wc
 
 
 def trajectory(stamp: np.ndarray, tracks: Tracks, map_: Map, segment: int = 0) -> Trajectory:

@@ -81,6 +81,7 @@ def export_grid(
     page = grid_map.GridMap.of(grid)
     written: tuple[Path, ...] = grid_map.write(out, page, start=start)
     if png is not None:
+        from slamcli.runs.placement import camera_path
         from slamcli.visualization.grid_picture import save_picture
 
         save_picture(png, grid, trajectory=camera_path(folder), title=str(folder.info()["dataset"]))
@@ -170,6 +171,7 @@ def plan(
     """
     from slamcli.config.options import Config
     from slamcli.navigation import planner
+    from slamcli.runs.placement import camera_path
     from slamcli.runs.run_directory import RunDir
     from slamcli.schema import Grid
     from slamcli.visualization.grid_picture import save_picture
@@ -296,15 +298,6 @@ def _read_map(page: Path) -> Grid:
     p_occupied = np.where(read.state < 0, np.nan, read.state).astype(np.float32)
     n_seen = (read.state >= 0).astype(np.int32)
     return Grid(p_occupied, n_seen, read.state, np.array(read.origin), np.array(read.resolution))
-
-
-def camera_path(folder: RunDir) -> np.ndarray:
-    """Return the camera centres (F, 3) of every frame in the level frame, NaN where lost."""
-    from slamcli.geometry import se3
-    from slamcli.schema import Ground, Map, Tracks, frame_poses
-
-    T_wc = frame_poses(folder.load(Tracks, "loop"), folder.load(Map, "loop"))
-    return se3.transform(folder.load(Ground, "densify").T_lw, T_wc[:, :3, 3])
 
 
 def warn_without_floor(folder: RunDir) -> None:

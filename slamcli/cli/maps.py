@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from slamcli.cli.common import Target, run_option
+from slamcli.cli.common import Target, check_ending, run_option
 from slamcli.errors import SlamError
 
 if TYPE_CHECKING:
@@ -38,7 +38,7 @@ def export_cloud(out: Path, run: str | None, frame: str) -> None:
     from slamcli.runs.run_directory import RunDir
     from slamcli.schema import Ground
 
-    _check_suffix(out, *cloud.WRITERS)
+    check_ending(out, *cloud.WRITERS)
     folder = RunDir.find(run)
     xyz, rgb, normal = cloud.read_ply(folder.stage_path("densify", "cloud.ply"))
     if frame == "world":
@@ -63,7 +63,7 @@ def export_octree(out: Path, run: str | None, colour: bool) -> None:
     from slamcli import files
     from slamcli.runs.run_directory import RunDir
 
-    suffix, folder = _check_suffix(out, ".bt", ".ot"), RunDir.find(run)
+    suffix, folder = check_ending(out, ".bt", ".ot"), RunDir.find(run)
     if colour:
         if suffix != ".ot":
             raise SlamError(f"{out}: a .bt file has no room for colours; write a .ot file, or leave out --colour")
@@ -107,7 +107,7 @@ def export_mesh(out: Path, run: str | None, voxel: float, min_area: float, trian
     from slamcli.formats.mesh import WRITERS
     from slamcli.runs.run_directory import RunDir
 
-    suffix = _check_suffix(out, *WRITERS)
+    suffix = check_ending(out, *WRITERS)
     mesh = mesh_cleaning.without_islands(_mesh(RunDir.find(run), voxel, even_colours), min_area=min_area)
     if triangles is not None:
         mesh = mesh_cleaning.decimated(mesh, triangles=triangles)
@@ -140,12 +140,6 @@ def _mesh(folder: RunDir, voxel: float, even_colours: bool | None) -> Mesh:
     return volume.mesh().moved(T_lw)
 
 
-def _check_suffix(out: Path, *suffixes: str) -> str:
-    if out.suffix.lower() not in suffixes:
-        raise SlamError(f"{out}: the name must end in {' or '.join(suffixes)}")
-    return out.suffix.lower()
-
-
 @click.command("render")
 @out_argument
 @run_option
@@ -162,15 +156,19 @@ def render_command(out: Path, run: str | None, what: str, azimuth: float, elevat
       slamcli render octree.png --what octree --azimuth 45
     """
     import cv2
+    import numpy as np
 
     from slamcli import files
+    from slamcli.runs import placement
     from slamcli.runs.run_directory import RunDir
     from slamcli.visualization import render
 
-    _check_suffix(out, ".png", ".jpg")
+    check_ending(out, ".png", ".jpg")
     folder = RunDir.find(run)
     view = render.View(azimuth_deg=azimuth, elevation_deg=elevation, width=size[0], height=size[1])
-    image = (_draw_cloud if what == "cloud" else _draw_octree)(folder, view, _camera_path(folder) if with_path else None)
+    path = placement.camera_path(folder) if with_path else None
+    path = None if path is None else path[np.isfinite(path[:, 0])]
+    image = (_draw_cloud if what == "cloud" else _draw_octree)(folder, view, path)
     done, data = cv2.imencode(out.suffix.lower(), image[..., ::-1])
     if not done:
         raise SlamError(f"{out}: the picture cannot be encoded")
@@ -191,11 +189,3 @@ def _draw_octree(folder: RunDir, view: View, path: np.ndarray | None) -> np.ndar
     from slamcli.visualization import render
 
     return render.draw_octree(octomap.read(folder.stage_path("octree", "map.ot")), view=view, path=path)
-
-
-def _camera_path(folder: RunDir) -> np.ndarray:
-    """Return the camera centres (N, 3) of the frames that have a pose, in the level frame."""
-    from slamcli.runs import placement
-    from slamcli.schema import Ground
-
-    return (folder.load(Ground, "densify").T_lw @ placement.camera_poses(folder))[:, :3, 3]

@@ -15,6 +15,8 @@ from slamcli.geometry.voxel import find_or_add, spread
 from slamcli.jit.kernel import kernel
 
 HALF_EXTENT = outlier_removal.HALF_EXTENT
+# Columns of the sums: of the weights; weighted, of the offset from the voxel's centre [voxels], the normal and the colour.
+WEIGHT, OFFSET, NORMAL, RGB = slice(0, 1), slice(1, 4), slice(4, 7), slice(7, 10)
 
 
 @dataclass(frozen=True)
@@ -73,11 +75,11 @@ class VoxelCloud:
         order = np.argsort(key)
         row, key = row[order], key[order]
         sums = self._rows.columns["sums"][row]
-        mean = sums[:, 1:] / sums[:, :1]
-        xyz = (voxel.unmorton(key) - HALF_EXTENT + 0.5 + mean[:, :3]) * self.side
-        length = np.linalg.norm(mean[:, 3:6], axis=1, keepdims=True)
-        normal = mean[:, 3:6] / np.where(length > 0, length, 1.0)
-        rgb = np.clip(np.rint(mean[:, 6:9]), 0, 255).astype(np.uint8)
+        mean = sums / sums[:, WEIGHT]
+        xyz = (voxel.unmorton(key) - HALF_EXTENT + 0.5 + mean[:, OFFSET]) * self.side
+        length = np.linalg.norm(mean[:, NORMAL], axis=1, keepdims=True)
+        normal = mean[:, NORMAL] / np.where(length > 0, length, 1.0)
+        rgb = np.clip(np.rint(mean[:, RGB]), 0, 255).astype(np.uint8)
         keep = outlier_removal.not_stray(xyz, key, side=self.side, neighbours=neighbours, max_deviation=max_deviation)
         return Cloud(xyz[keep].astype(np.float32), rgb[keep], normal[keep])
 

@@ -30,9 +30,9 @@ OCCUPIED, FREE, UNKNOWN = 1, 0, -1
 
 
 def build_grid(frames: Iterable[tuple[np.ndarray, np.ndarray]], camera: Camera, *, settings: GridConfig, sensor: SensorConfig) -> Grid:
-    """Build the grid from key frames.
+    """Build the grid from frames.
 
-    frames : per key frame, in order, (depth (H, W) float32 [m], NaN = none; T_lk (4, 4) camera to level frame)
+    frames : per frame, in order, (depth (H, W) float32 [m], NaN = none; T_lk (4, 4) camera to level frame)
     Raises SlamError for settings that contradict each other and when the grid would not fit into memory.
     """
     check(settings)

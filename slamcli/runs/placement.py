@@ -44,6 +44,12 @@ def camera_poses(run: RunDir) -> np.ndarray:
     return T_wc[np.isfinite(T_wc[:, 0, 0])]
 
 
+def camera_path(run: RunDir) -> np.ndarray:
+    """Return the camera centres (F, 3) of every frame in the level frame [m], NaN where lost."""
+    T_wc = frame_poses(run.load(Tracks, "loop"), run.load(Map, "loop"))
+    return se3.transform(run.load(Ground, "densify").T_lw, T_wc[:, :3, 3])
+
+
 def lines(placement: Placement) -> list[tuple[str, str]]:
     """Tell the start pose and T_lw, each with its name."""
     x, y, yaw = _rounded(placement.first)

@@ -154,7 +154,7 @@ class _Refinement:
         self.T_kc[i] = se3.inverse(estimate.T_cw @ self.sparse_map.kf.T_wk[kf])
 
     def _find(
-        self, i: int, T_wc: np.ndarray, landmarks: guided_matching.Candidates, *, widening: float = 1.0, least: int = 0
+        self, i: int, T_wc: np.ndarray, landmarks: guided_matching.Landmarks, *, widening: float = 1.0, least: int = 0
     ) -> PoseEstimate | None:
         """Estimate the pose of frame `i` from a guess; None where fewer landmarks agree than the settings, half of before, or `least` say."""
         wanted = max(least, self.settings.min_inliers, int(self.n_inliers[i]) // 2)
@@ -175,6 +175,6 @@ class _Refinement:
         estimate = refine_on_landmarks(T_cw, landmarks.xyz[which], frame, feature[which], self.camera)
         return estimate if estimate.n_inliers >= wanted else None
 
-    def _landmarks_around(self, kf: int) -> guided_matching.Candidates:
+    def _landmarks_around(self, kf: int) -> guided_matching.Landmarks:
         neighbours, _ = self.sparse_map.covisible(kf)
-        return self.sparse_map.candidates(self.sparse_map.landmarks_in(np.append(neighbours[:NEIGHBOURS], kf)))
+        return self.sparse_map.landmarks(self.sparse_map.landmarks_in(np.append(neighbours[:NEIGHBOURS], kf)))

@@ -16,7 +16,7 @@ CROWD_M, CROWD_COSINE = 0.1, 0.9945  # key frames nearer than this, and turned b
 
 
 @dataclass(frozen=True)
-class View:
+class Sighting:
     """What a tracked frame sees, as far as the rule asks."""
 
     n_landmarks: int  # features that show a landmark
@@ -27,18 +27,18 @@ class View:
     n_crowd: int  # key frames that stand where it does
 
 
-def wants_key_frame(view: View, settings: TrackConfig) -> bool:
+def wants_key_frame(seen: Sighting, settings: TrackConfig) -> bool:
     """Decide whether a frame that landmarks hold becomes a key frame.
 
     It does where it meets much new surface; and, unless enough key frames stand there already, where too little of its reference is
     left in view or the last key frame is long ago. Another one in the same place would only make every later frame dearer.
     """
-    if view.n_near_landmarks + view.n_near_new < settings.min_inliers:
+    if seen.n_near_landmarks + seen.n_near_new < settings.min_inliers:
         return False
-    meets_new_surface = view.n_near_landmarks < FEW_NEAR_LANDMARKS and view.n_near_new > MANY_NEAR_FEATURES
-    leaves_reference = view.n_landmarks < settings.key_frame_share * view.n_reference
-    is_overdue = view.frames_since >= settings.key_frame_gap
-    is_crowded = view.n_crowd >= settings.key_frame_crowd
+    meets_new_surface = seen.n_near_landmarks < FEW_NEAR_LANDMARKS and seen.n_near_new > MANY_NEAR_FEATURES
+    leaves_reference = seen.n_landmarks < settings.key_frame_share * seen.n_reference
+    is_overdue = seen.frames_since >= settings.key_frame_gap
+    is_crowded = seen.n_crowd >= settings.key_frame_crowd
     return meets_new_surface or ((leaves_reference or is_overdue) and not is_crowded)
 
 

@@ -37,7 +37,7 @@ class LocalMap:
         """
         sparse_map, settings = self._sparse_map, self._settings
         local = self._landmarks_around(ids)
-        candidates = sparse_map.candidates(local)
+        candidates = sparse_map.landmarks(local)
         for radius in (settings.search_radius_px, WIDER * settings.search_radius_px):
             feature, is_visible = guided_matching.search(
                 T_cw,

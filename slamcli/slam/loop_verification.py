@@ -72,7 +72,7 @@ def _find_landmarks(
     """Look for the landmarks around j in i, from a guess of its pose T_iw in the world that j stands in."""
     neighbours, _ = sparse_map.covisible(candidate.kf_j)
     ids = sparse_map.landmarks_in(np.append(neighbours[: settings.neighbours], candidate.kf_j))
-    landmarks = sparse_map.candidates(ids)
+    landmarks = sparse_map.landmarks(ids)
     for widening in WIDENINGS:
         feature, _ = guided_matching.search(
             T_iw,

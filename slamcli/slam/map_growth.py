@@ -29,7 +29,7 @@ class MapGrowth:
         """Make frame `i` a key frame: note what it sees of the map, and add a landmark for every other feature with depth.
 
         landmark : (N,) of each feature, -1 = none
-        Returns the key frame and the landmarks added; `settle` does the rest.
+        Returns the key frame and the landmarks added; `cull_share_adjust` does the rest.
         """
         sparse_map = self._sparse_map
         kf = sparse_map.add_key_frame(i, T_wc, segment)
@@ -39,14 +39,14 @@ class MapGrowth:
         x_w = se3.transform(T_wc, self._camera.backproject(frame.xy[new], frame.depth[new]))
         return kf, sparse_map.add_landmarks(kf, frame.first_row + new, x_w)
 
-    def settle(self, kf: int, added: np.ndarray, known: np.ndarray) -> None:
+    def cull_share_adjust(self, kf: int, added: np.ndarray, known: np.ndarray) -> None:
         """Cull what was not found again, share the landmarks `added` with the key frames around, and adjust the window.
 
         known : landmarks that were there before and that `kf` sees
         """
         self.cull(kf)
         self._on_probation = np.concatenate([self._on_probation, added])
-        self._share(kf, added)
+        self._share_with_neighbours(kf, added)
         self._sparse_map.refresh(known)
         self._adjust_window(kf)
 
@@ -60,7 +60,7 @@ class MapGrowth:
         self._sparse_map.remove_landmarks(ids[is_bad])
         self._on_probation = ids[~is_bad & (age < PROBATION)]
 
-    def _share(self, kf: int, added: np.ndarray) -> None:
+    def _share_with_neighbours(self, kf: int, added: np.ndarray) -> None:
         """Look for the new landmarks in the key frames around: a free feature becomes a view, a landmark there is fused."""
         neighbours, shared = self._sparse_map.covisible(kf)
         most = self._settings.share_key_frames

@@ -10,7 +10,7 @@
 import numpy as np
 
 from slamcli.geometry import se3
-from slamcli.schema import Doubt, Map, Tracks, frame_poses, frame_segments
+from slamcli.schema import Doubt, Map, Tracks, poses_in_segments
 from slamcli.slam import doubt, moving_objects
 from slamcli.slam.doubt import Finding
 from slamcli.slam.moving_objects import Views
@@ -80,9 +80,7 @@ def _disagreement(stamp: np.ndarray, first: tuple[Tracks, Map], final: tuple[Tra
     before = np.minimum(np.searchsorted(stamp, stamp - SPAN), later)
     motion = []
     for tracks, map_ in (first, final):
-        segment, T_wc = frame_segments(tracks, map_), np.full((len(stamp), 4, 4), np.nan)
-        for number in np.unique(segment[segment >= 0]):
-            T_wc[segment == number] = frame_poses(tracks, map_, int(number))[segment == number]
+        segment, T_wc = poses_in_segments(tracks, map_)
         T_wc[before[segment != segment[before]]] = np.nan
         motion.append(se3.inverse(T_wc[before]) @ T_wc)
     return np.linalg.norm((se3.inverse(motion[0]) @ motion[1])[:, :3, 3], axis=1)

@@ -99,21 +99,21 @@ class Tracker:
     def _wants_key_frame(self, i: int, frame: FrameFeatures, location: Location) -> bool:
         if location.placement is not None:
             return self._leaves_reference_by_depth(i, location.placement)
-        return key_frames.wants_key_frame(self._view(i, frame, location.landmark), self._settings)
+        return key_frames.wants_key_frame(self._sighting(i, frame, location.landmark), self._settings)
 
     def _leaves_reference_by_depth(self, i: int, placement: Placement) -> bool:
         if self._poses.anchored < i:
             return False  # what rests on it would share the error that the frames before it lent
         return key_frames.wants_key_frame_by_depth(self._poses.T_kc[i], placement.alignment.overlap, self._settings)
 
-    def _view(self, i: int, frame: FrameFeatures, landmark: np.ndarray) -> key_frames.View:
+    def _sighting(self, i: int, frame: FrameFeatures, landmark: np.ndarray) -> key_frames.Sighting:
         """Count what frame `i` sees, for the key-frame rule."""
         T_wc = self._poses.T_wc(i)
         kf, lm = self._sparse_map.kf, self._sparse_map.lm
         is_near, is_known, is_here = np.isfinite(frame.depth), landmark >= 0, kf.segment == self._segment
         seen = self._sparse_map.landmarks_of(int(self._poses.ref_kf[i]))
         least = min(2, np.count_nonzero(is_here))
-        return key_frames.View(
+        return key_frames.Sighting(
             n_landmarks=int(np.count_nonzero(is_known)),
             n_near_landmarks=int(np.count_nonzero(is_known & is_near)),
             n_near_new=int(np.count_nonzero(~is_known & is_near)),
@@ -133,7 +133,7 @@ class Tracker:
         if self._background is not None:
             self._join_by_background(kf, self._background)
         self._poses.make_key_frame(i, kf)
-        self._growth.settle(kf, added, known)
+        self._growth.cull_share_adjust(kf, added, known)
         return self._sparse_map.resolve(self._sparse_map.lm_of_row[self._sparse_map.rows_of(kf)])
 
     def _join_by_background(self, kf: int, T_wb: np.ndarray) -> None:

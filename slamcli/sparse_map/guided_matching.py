@@ -33,7 +33,7 @@ class FrameFeatures:
 
 
 @dataclass(frozen=True)
-class Candidates:
+class Landmarks:
     """Landmarks that may be seen, in the form the kernels take."""
 
     xyz: np.ndarray  # (L, 3) float64 m, world
@@ -69,7 +69,7 @@ def _sort_into_buckets(xy: f4[:, ::1], columns: i8, rows: i8, start: i4[::1], or
 
 def search(
     T_cw: np.ndarray,
-    candidates: Candidates,
+    landmarks: Landmarks,
     frame: FrameFeatures,
     camera: Camera,
     *,
@@ -88,10 +88,10 @@ def search(
     intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
     return _search(
         np.ascontiguousarray(T_cw),
-        candidates.xyz,
-        candidates.desc,
-        candidates.direction,
-        candidates.reach,
+        landmarks.xyz,
+        landmarks.desc,
+        landmarks.direction,
+        landmarks.reach,
         frame.xy,
         frame.octave,
         frame.desc,

@@ -27,7 +27,7 @@ def fuse_landmarks(sparse_map: SparseMap, kf: int, ids: np.ndarray, camera: Came
     T_kw = se3.inverse(sparse_map.kf.T_wk[kf])
     feature, _ = guided_matching.search(
         T_kw,
-        sparse_map.candidates(ids),
+        sparse_map.landmarks(ids),
         frame,
         camera,
         octave_scale=sparse_map.octave_scale,

@@ -7,7 +7,7 @@ from slamcli.geometry import se3
 from slamcli.geometry.bits import hamming
 from slamcli.jit.kernel import kernel
 from slamcli.schema import Features, Map
-from slamcli.sparse_map.guided_matching import Candidates
+from slamcli.sparse_map.guided_matching import Landmarks
 from slamcli.sparse_map.table import Table
 
 
@@ -24,22 +24,35 @@ class SparseMap:
         self.octave = np.ascontiguousarray(features.octave)
         self._offset = np.array(features.offset, dtype=np.int64)
         self.octave_scale = float(features.octave_scale)
-        self.kf = Table(frame=("i4",), segment=("i4",), T_wk=("f8", 4, 4))
+        self.kf = Table(
+            frame=("i4",),
+            segment=("i4",),  # of the map, each with a world frame of its own
+            T_wk=("f8", 4, 4),  # key frame to world
+        )
         self.lm = Table(
-            xyz=("f8", 3),
-            desc=("u8", 4),
-            direction=("f8", 3),
-            reach=("f8",),
-            head=("i4",),
-            n_obs=("i4",),
-            n_visible=("i4",),
-            n_found=("i4",),
-            first_kf=("i4",),
-            replaced_by=("i4",),
+            xyz=("f8", 3),  # m, world
+            desc=("u8", 4),  # of the observation nearest to all others, 256 bits
+            direction=("f8", 3),  # mean unit vector from the key frames that saw it
+            reach=("f8",),  # m, distance at which it appears at octave 0
+            head=("i4",),  # its first row in `obs`
+            n_obs=("i4",),  # key frames that observe it
+            n_visible=("i4",),  # frames that should have seen it
+            n_found=("i4",),  # frames that did
+            first_kf=("i4",),  # key frame that created it
+            replaced_by=("i4",),  # landmark that it was fused into, -1 = none
             is_alive=("?",),
         )
-        self.obs = Table(lm=("i4",), kf=("i4",), row=("i8",), next=("i4",))
-        self.edge = Table(kf=("i4", 2), T_ij=("f8", 4, 4), information=("f8", 6, 6))
+        self.obs = Table(
+            lm=("i4",),
+            kf=("i4",),  # -1 = removed
+            row=("i8",),  # in the table of all features
+            next=("i4",),  # of the same landmark, -1 = none
+        )
+        self.edge = Table(
+            kf=("i4", 2),  # i, j
+            T_ij=("f8", 4, 4),  # measured by depth ICP: x_i = T_ij x_j
+            information=("f8", 6, 6),  # of its left twist (rho, phi) [1/m^2, 1/rad^2]
+        )
         self.lm_of_row = np.full(int(features.offset[-1]), -1, dtype=np.int32)
 
     def add_key_frame(self, frame: int, T_wk: np.ndarray, segment: int = 0) -> int:
@@ -126,9 +139,9 @@ class SparseMap:
         order = np.argsort(-counts, kind="stable")[: np.count_nonzero(counts)]
         return order.astype(np.int32), counts[order]
 
-    def candidates(self, ids: np.ndarray) -> Candidates:
+    def landmarks(self, ids: np.ndarray) -> Landmarks:
         """Return landmarks in the form that guided matching takes."""
-        return Candidates(*(column.take(ids, axis=0) for column in (self.lm.xyz, self.lm.desc, self.lm.direction, self.lm.reach)))
+        return Landmarks(*(column.take(ids, axis=0) for column in (self.lm.xyz, self.lm.desc, self.lm.direction, self.lm.reach)))
 
     def observations_of(self, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return all observations of landmarks `ids`: index into `ids`, key frame, feature row; sorted by (landmark, key frame)."""

@@ -24,7 +24,7 @@ BODY_VIEWS = 60  # spread over the drive, in which the robot's own body is looke
 
 
 def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
-    """Write map.pgm, map.yaml and the Grid before the decision rule."""
+    """Write map.pgm, map.yaml and the Grid."""
     grid.check(cfg.grid2d)
     ground = inputs.load(Ground, "densify")
     if not ground.is_found:

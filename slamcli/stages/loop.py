@@ -78,7 +78,7 @@ def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
             "landmarks": len(map_.lm_xyz),
             "doubtful": int(doubts.is_doubtful.sum()),
         }
-        | moving_parts.told(moving)
+        | moving_parts.figures(moving)
         | doubt.to_summary(pose_doubt.findings(doubts))
     )
 

@@ -3,7 +3,7 @@
 import numpy as np
 
 from slamcli.geometry.camera import Camera
-from slamcli.schema import CoarseDepth, Features, Map, Moving, Tracks, frame_poses, frame_segments
+from slamcli.schema import CoarseDepth, Features, Map, Moving, Tracks, poses_in_segments
 from slamcli.slam import moving_objects
 from slamcli.slam.moving_objects import FOR_POSES, Rule, Views
 from slamcli.stages.contract import Inputs, Summary, Tools
@@ -35,7 +35,7 @@ def still_depth(depth: np.ndarray, moving: Moving, frame: int, camera: Camera) -
     return moving_objects.hide_pixels(depth, moving.moving[frame], camera) if len(moving.moving) else depth
 
 
-def told(moving: Moving) -> Summary:
+def figures(moving: Moving) -> Summary:
     """Tell how much moves: frames in which something does, and the mean share of their views."""
     share = moving.moving.mean(axis=(1, 2)) if len(moving.moving) else np.zeros(0)
     moves = share[share > MOVES]
@@ -44,8 +44,5 @@ def told(moving: Moving) -> Summary:
 
 def views(inputs: Inputs, tracks: Tracks, map_: Map) -> Views:
     """Gather the coarse depth images with these poses."""
-    features, world = inputs.load(Features, "extract"), frame_segments(tracks, map_)
-    T_wc = np.full((len(world), 4, 4), np.nan)
-    for segment in np.unique(world[world >= 0]):
-        T_wc[world == segment] = frame_poses(tracks, map_, int(segment))[world == segment]
-    return Views(inputs.load(CoarseDepth, "extract").coarse_depth, np.asarray(features.stamp), T_wc, world, inputs.camera())
+    stamp, (segment, T_wc) = inputs.load(Features, "extract").stamp, poses_in_segments(tracks, map_)
+    return Views(inputs.load(CoarseDepth, "extract").coarse_depth, np.asarray(stamp), T_wc, segment, inputs.camera())

@@ -50,7 +50,7 @@ def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
 
 
 def rounds(inputs: Inputs, grid: OccupancyMap, option: OctreeConfig) -> Iterator[list[PosedFrame]]:
-    """Yield the frames to insert, each with its pose (4, 4) camera to level frame, in the order of time. Repeat until no scan is added."""
+    """Yield the frames to insert, each with its pose (4, 4) camera to level frame: the key frames, then twice those that the map is asked about."""
     T_lw = inputs.load(Ground, "densify").T_lw
     poses = [(frame, T_lw @ T_wc) for frame, T_wc in depth_poses(inputs, frames="all")]
     if option.frames == "all":

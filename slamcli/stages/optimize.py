@@ -37,7 +37,7 @@ def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
     save_map(out, features.stamp, tracks, map_)
     artifacts.save(sensing.timing, out)
     write_camera(out, sensing.camera)
-    return {"frames": len(features.stamp), "key_frames": len(map_.kf_frame)} | told(sensing) | summary
+    return {"frames": len(features.stamp), "key_frames": len(map_.kf_frame)} | figures(sensing) | summary
 
 
 def refine(
@@ -83,7 +83,7 @@ def refine(
     return tracks, sensing, summary
 
 
-def told(sensing: Sensing) -> dict:
+def figures(sensing: Sensing) -> dict:
     """Tell the numbers found with their standard deviations."""
     figures = {}
     for name, sigma in sensing.sigma.items():

@@ -55,7 +55,7 @@ def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
         "landmarks": len(map_.lm_xyz),
         "edges": len(map_.edge_kf),
         "lost_spans": [list(span) for span in lost],
-    } | moving_parts.told(moving)
+    } | moving_parts.figures(moving)
 
 
 def _find_background(inputs: Inputs, cfg: Config, tools: Tools) -> tuple[Moving, np.ndarray]:

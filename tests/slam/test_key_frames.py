@@ -13,14 +13,14 @@ from slamcli.slam.key_frames import (
     MANY_NEAR_FEATURES,
     MOVED_M,
     TURNED_RAD,
-    View,
+    Sighting,
     count_crowd,
     wants_key_frame,
     wants_key_frame_by_depth,
 )
 
 SETTINGS = TrackConfig(min_inliers=15, key_frame_share=0.75, key_frame_gap=30, key_frame_crowd=4)
-CALM = View(n_landmarks=400, n_near_landmarks=300, n_near_new=200, n_reference=420, frames_since=3, n_crowd=0)  # nothing asks for one
+CALM = Sighting(n_landmarks=400, n_near_landmarks=300, n_near_new=200, n_reference=420, frames_since=3, n_crowd=0)  # nothing asks for one
 
 
 def test_a_frame_that_sees_its_reference_well_is_none():

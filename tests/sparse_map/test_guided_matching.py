@@ -8,7 +8,7 @@ from scenes import CAMERA
 
 from slamcli.geometry import se3
 from slamcli.sparse_map import guided_matching
-from slamcli.sparse_map.guided_matching import Candidates, FrameFeatures
+from slamcli.sparse_map.guided_matching import FrameFeatures, Landmarks
 
 SCALE = 1.2
 
@@ -26,7 +26,7 @@ def bits(a: np.ndarray, b: np.ndarray) -> int:
     return sum(int(x ^ y).bit_count() for x, y in zip(a.tolist(), b.tolist(), strict=True))
 
 
-def slow_search(T_cw, landmarks: Candidates, seen: FrameFeatures, *, radius_px: float, max_distance: int, ratio: float):
+def slow_search(T_cw, landmarks: Landmarks, seen: FrameFeatures, *, radius_px: float, max_distance: int, ratio: float):
     feature, is_visible = np.full(len(landmarks.xyz), -1), np.zeros(len(landmarks.xyz), dtype=bool)
     owner: dict[int, tuple[int, int]] = {}
     centre = se3.inverse(T_cw)[:3, 3]
@@ -57,7 +57,7 @@ def slow_search(T_cw, landmarks: Candidates, seen: FrameFeatures, *, radius_px: 
     return feature, is_visible
 
 
-def scene(seed: int, n: int = 300) -> tuple[np.ndarray, Candidates, FrameFeatures]:
+def scene(seed: int, n: int = 300) -> tuple[np.ndarray, Landmarks, FrameFeatures]:
     """Landmarks in and beside the view, and features near the projections of most, whose descriptors differ from theirs by some bits."""
     rng = np.random.default_rng(seed)
     T_cw = se3.exp(rng.normal(0, 0.2, 6))
@@ -68,7 +68,7 @@ def scene(seed: int, n: int = 300) -> tuple[np.ndarray, Candidates, FrameFeature
     sight = xyz - se3.inverse(T_cw)[:3, 3]
     distance = np.linalg.norm(sight, axis=1)
     direction = sight / distance[:, None] + rng.normal(0, 0.5, (n, 3))
-    landmarks = Candidates(
+    landmarks = Landmarks(
         xyz, desc, direction / np.linalg.norm(direction, axis=1, keepdims=True), distance * SCALE ** rng.uniform(-3.4, 10.4, n)
     )
     seen = np.flatnonzero(x_c[:, 2] > 0.1)
@@ -107,5 +107,5 @@ def test_without_features_or_landmarks_nothing_is_found() -> None:
     nothing = frame(np.zeros((0, 2), np.float32), np.zeros((0, 4), np.uint64), np.zeros(0, np.uint8))
     options = {"octave_scale": SCALE, "radius_px": 5.0, "max_distance": 64, "ratio": 0.9}
     assert (guided_matching.search(T_cw, landmarks, nothing, CAMERA, **options)[0] == -1).all()
-    none = Candidates(np.zeros((0, 3)), np.zeros((0, 4), np.uint64), np.zeros((0, 3)), np.zeros(0))
+    none = Landmarks(np.zeros((0, 3)), np.zeros((0, 4), np.uint64), np.zeros((0, 3)), np.zeros(0))
     assert len(guided_matching.search(T_cw, none, nothing, CAMERA, **options)[0]) == 0
