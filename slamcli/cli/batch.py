@@ -22,10 +22,16 @@ if TYPE_CHECKING:
 @click.option("--out", default="runs", show_default=True, metavar="DIR|URL", help="Folder of the runs, one for each recording.")
 @click.option("--cluster", metavar="ADDRESS", help="A Dask scheduler, such as tcp://host:8786. [default: workers on this machine]")
 @click.option("--workers", type=click.IntRange(1, 1024), help="Worker processes on this machine. [default: by its cores and memory]")
-@click.option("--threads", type=click.IntRange(1, 64), help="Of a stage. [default: cores a worker; with --cluster 1]")
-@click.option("--retries", type=click.IntRange(0, 100), default=2, show_default=True, help="Of a task that a machine's fault ended.")
+@click.option("--threads", type=click.IntRange(1, 64), help="Threads of each stage. [default: cores per worker; with --cluster 1]")
+@click.option(
+    "--retries",
+    type=click.IntRange(0, 100),
+    default=2,
+    show_default=True,
+    help="How often a task that failed through a machine's fault is tried again.",
+)
 @click.option("--until", type=click.Choice(NAMES), default=NAMES[-1], show_default=True, help="Stop each recording after this stage.")
-@click.option("--data", metavar="DIR", help="Where recordings lie. [default: $SLAMCLI_DATA, else ./data]")
+@click.option("--data", metavar="DIR", help="Folder of recordings. [default: $SLAMCLI_DATA, else ./data]")
 @click.option("--dry-run", is_flag=True, help="Say what would be run, and run nothing.")
 @config_option
 @set_option
@@ -34,10 +40,10 @@ def batch(
     recordings: tuple[str, ...], out: str, cluster: str | None, workers: int | None, threads: int | None, retries: int, until: str,
     data: str | None, dry_run: bool, config_name: str | None, assignments: tuple[str, ...], as_json: bool,
 ) -> None:  # fmt: skip
-    """Run many recordings, each into a run of its own below --out; what is up to date there is kept, so a batch can be given again.
+    """Make a run of each of many recordings below --out; runs that are up to date are kept, so the same command can be given again.
 
-    RECORDING is what `slamcli run` takes, or a URL such as s3://bucket/monday; LIST.txt has one a line. Writes batch.csv and batch.html
-    into --out: state, coverage, error, doubts and cost of every recording, and why those failed that failed. Status 1 when one failed.
+    RECORDING is what `slamcli run` takes, or a URL such as s3://bucket/monday; LIST.txt has one per line. Writes batch.csv and batch.html
+    into --out: state, coverage, error, doubts and cost of every recording, and the reason for each that failed. Exit status 1 when one failed.
 
     \b
       pip install 'slamcli[cluster]'

@@ -94,7 +94,7 @@ class Mount(click.ParamType):
 mount_option = click.option(
     "--mount",
     type=Mount(),
-    help="Where the camera's body is on the robot's base [m, rad], as a URDF origin: tell the base's poses instead.",
+    help="Where the camera's body is on the robot's base [m, rad], as a URDF origin; the poses are then the base's.",
 )
 
 
@@ -129,8 +129,8 @@ def _voice(context: click.Context, parameter: click.Parameter, value: int) -> in
 
 def verbose_option(function: Function) -> Function:
     """Add `-v` and `--quiet`, which count on the group and on the command together."""
-    quiet = click.option("--quiet", is_flag=True, expose_value=False, callback=_voice, help="Tell nothing but warnings and errors.")
-    verbose = click.option("-v", "--verbose", count=True, expose_value=False, callback=_voice, help="Tell more; -vv tells everything.")
+    quiet = click.option("--quiet", is_flag=True, expose_value=False, callback=_voice, help="Show nothing but warnings and errors.")
+    verbose = click.option("-v", "--verbose", count=True, expose_value=False, callback=_voice, help="Show more; -vv shows everything.")
     return quiet(verbose(function))
 
 
@@ -157,7 +157,7 @@ def recording_options(function: Function) -> Function:
         click.option("--start", "recording_start", type=click.FloatRange(min=0), metavar="S", help="Begin S seconds after the first frame."),
         click.option("--end", "recording_end", type=click.FloatRange(min=0), metavar="S", help="Stop S seconds after the first frame."),
         click.option("--every", "recording_every", type=click.IntRange(min=1), metavar="N", help="Use every N-th frame."),
-        click.option("--fps", "recording_fps", type=click.FloatRange(min=0, min_open=True), metavar="HZ", help="Frame rate, where stamps are missing or no clock."),
+        click.option("--fps", "recording_fps", type=click.FloatRange(min=0, min_open=True), metavar="HZ", help="Frame rate, where stamps are missing or are no clock."),
         click.option("--camera", "recording_known_camera", metavar="NAME", help="Nominal intrinsics of a known camera: kinect1, d435, azure ..."),
     )  # fmt: skip
     for option in reversed(options):

@@ -59,7 +59,9 @@ def _trajectory_options(function: Any) -> Any:
         click.argument("runs", nargs=-1, metavar="[RUN]..."),
         run_option,
         click.option(
-            "--stage", type=click.Choice(["track", "optimize", "loop", "all"]), help="Whose trajectory. [default: the last there is]"
+            "--stage",
+            type=click.Choice(["track", "optimize", "loop", "all"]),
+            help="The stage whose trajectory is measured. [default: the last that has been run]",
         ),
         click.option(
             "--truth",
@@ -67,9 +69,9 @@ def _trajectory_options(function: Any) -> Any:
             metavar="FILE",
             help="True trajectory (TUM format) instead of the recording's.",
         ),
-        click.option("--truth-offset", type=float, default=0.0, metavar="S", help="Added to the stamps of the truth [s]."),
+        click.option("--truth-offset", type=float, default=0.0, metavar="S", help="Seconds added to the stamps of the truth."),
         click.option("--other", multiple=True, metavar="NAME=FILE", help="Another system's trajectory of this recording (TUM format)."),
-        click.option("--plot", type=Target(), metavar="FILE", help="Draw it (.png, .pdf, .svg)."),
+        click.option("--plot", type=Target(), metavar="FILE", help="Draw the errors (.png, .pdf, .svg)."),
         click.option("--style", type=click.Choice(["text", "csv", "latex"]), default="text", show_default=True, help="Form of the table."),
         json_option,
     ):
@@ -87,7 +89,7 @@ def ape_command(
 
     \b
       slamcli eval ape                               the last run
-      slamcli eval ape --stage all                   what each stage is worth
+      slamcli eval ape --stage all                   after each stage
       slamcli eval ape runs/a runs/b --style latex   several in one table
       slamcli eval ape --other ORB-SLAM3=f.txt --plot ape.png
       slamcli eval ape --truth mocap.txt --truth-offset -1.2
@@ -109,7 +111,7 @@ def ape_command(
 
 @eval_group.command("rpe")
 @_trajectory_options
-@click.option("--seconds", type=click.FloatRange(min=0, min_open=True), default=1.0, show_default=True, help="Interval.")
+@click.option("--seconds", type=click.FloatRange(min=0, min_open=True), default=1.0, show_default=True, help="Interval [s].")
 def rpe_command(
     runs: tuple[str, ...], run: str | None, stage: str | None, truth: Path | None, truth_offset: float, other: tuple[str, ...],
     plot: Path | None, style: str, as_json: bool, seconds: float,
@@ -139,7 +141,7 @@ def rpe_command(
 @run_option
 @json_option
 def map_command(run: str | None, as_json: bool) -> None:
-    """Octree against the depth images; of a simulated recording also the grid against its scene.
+    """Measure the octree against the depth images and, for a simulated recording, the grid against its scene.
 
     The first replays the key frames and counts the cells of the octree whose state agrees, as OctoMap's eval_octree_accuracy does.
     """

@@ -25,12 +25,16 @@ LAYOUT_OF = {ending: layout for layout, endings in TRAJECTORY_FORMATS.items() fo
 @click.command("export-trajectory")
 @click.argument("out", type=Target())
 @run_option
-@click.option("--stage", type=click.Choice(["track", "optimize", "loop"]), help="Whose trajectory; default: the last there is.")
+@click.option(
+    "--stage",
+    type=click.Choice(["track", "optimize", "loop"]),
+    help="The stage whose trajectory is written; default: the last that has been run.",
+)
 @click.option("--frame", type=click.Choice(["world", "level"]), default="world", show_default=True, help="level: z up, floor at z = 0.")
 @click.option(
     "--format", "layout", type=click.Choice(list(TRAJECTORY_FORMATS)), help="[default: by OUT's ending]; kitti has no time stamps."
 )
-@click.option("--sure-only", is_flag=True, help="Leave out the poses that the run itself doubts; of the final trajectory.")
+@click.option("--sure-only", is_flag=True, help="Leave out the poses that the run itself doubts; only for the final trajectory.")
 @mount_option
 @json_option
 def export_trajectory(
@@ -107,11 +111,9 @@ frames_option = click.option(
     type=click.Choice(["key", "all"]),
     default="key",
     show_default=True,
-    help="Whose images: key frames, or all that have a pose.",
+    help="Frames whose images are written: key frames, or all that have a pose.",
 )
-images_option = click.option(
-    "--images", type=click.Choice(["png", "jpg"]), default="png", show_default=True, help="How images are written."
-)
+images_option = click.option("--images", type=click.Choice(["png", "jpg"]), default="png", show_default=True, help="Format of the images.")
 
 
 @click.command("export-colmap")

@@ -41,11 +41,11 @@ class Place(click.ParamType):
 @run_option
 @click.option("--png", type=Target(), help="Also draw a picture with the trajectory, a scale bar and a legend.")
 @click.option("--costs", type=Target(), help="Also write inflation costs (.pgm or .png, mode: scale).")
-@click.option("--reach", default=0.55, show_default=True, help="Of the costs, from an obstacle's edge [m].")
+@click.option("--reach", default=0.55, show_default=True, help="How far costs reach from an obstacle's edge [m].")
 @click.option(
-    "--falloff", default=10.0, show_default=True, help="Of the costs beyond the robot's radius: nav2's cost_scaling_factor [1/m]."
+    "--falloff", default=10.0, show_default=True, help="How fast costs fall beyond the robot's radius: nav2's cost_scaling_factor [1/m]."
 )
-@click.option("--radius", type=float, help="Of the robot, for the costs [m]. [default: the run's robot.radius]")
+@click.option("--radius", type=float, help="The robot's radius, for the costs [m]. [default: the run's robot.radius]")
 @click.option(
     "--keep-out",
     type=click.Path(path_type=Path, dir_okay=False, exists=True),
@@ -57,9 +57,9 @@ def export_grid(
     out: Path, run: str | None, png: Path | None, costs: Path | None, reach: float, falloff: float, radius: float | None,
     keep_out: Path | None, mount: tuple[float, ...] | None, as_json: bool,
 ) -> None:  # fmt: skip
-    """Write the navigation grid OUT (.pgm) and its page (.yaml) beside it, for map_server and nav2.
+    """Write the navigation grid OUT (.pgm) and its description (.yaml) beside it, for map_server and nav2.
 
-    The page's first line tells where the recording began: a robot's initial pose there, with --mount that of its base.
+    The first line of the .yaml file is where the recording began: the initial pose of the camera, or with --mount that of the robot's base.
 
     \b
       slamcli export-grid map.pgm --png map.png
@@ -141,17 +141,20 @@ def _start(folder: RunDir, mount: tuple[float, ...] | None) -> tuple[float, floa
 
 @click.command()
 @click.option(
-    "--start", type=Place(), required=True, help="Where the robot is, such as 0.5,1.0 [m], or first or last: below the camera there."
+    "--start",
+    type=Place(),
+    required=True,
+    help="Where the robot is: x,y such as 0.5,1.0 [m], or first or last: below the camera at that frame.",
 )
-@click.option("--goal", type=Place(), help="Where it is to go: x,y [m], first or last.")
-@click.option("--reachable", is_flag=True, help="Tell instead of a path how much of the free floor it can get to, and draw it.")
+@click.option("--goal", type=Place(), help="Where it should go: x,y [m], first or last.")
+@click.option("--reachable", is_flag=True, help="Instead of a path, show how much of the free floor the robot can reach.")
 @run_option
 @click.option("--map", "page", type=click.Path(path_type=Path, dir_okay=False), help="Plan on this grid map (.yaml) instead of the run's.")
-@click.option("--radius", type=float, help="Of the robot [m]. [default: the run's robot.radius]")
-@click.option("--clearance", default=0.3, show_default=True, help="Being nearer to obstacles than this beyond the radius costs [m].")
-@click.option("--weight", default=3.0, show_default=True, help="How much more a metre along an obstacle costs than one in the open.")
-@click.option("--allow-unknown", is_flag=True, help="Drive through cells that were never seen, too.")
-@click.option("-o", "--out", type=Target(), help="Write the path: .csv or .json.")
+@click.option("--radius", type=float, help="The robot's radius [m]. [default: the run's robot.radius]")
+@click.option("--clearance", default=0.3, show_default=True, help="Distance beyond the radius within which obstacles add to the cost [m].")
+@click.option("--weight", default=3.0, show_default=True, help="How many times more a metre along an obstacle costs than one in the open.")
+@click.option("--allow-unknown", is_flag=True, help="Also drive through cells that were never seen.")
+@click.option("-o", "--out", type=Target(), help="Write the path to this file: .csv or .json.")
 @click.option("--png", type=Target(own="plan.png"), help="Draw the path. [default: plan.png in the run directory]")
 @json_option
 def plan(
@@ -161,7 +164,7 @@ def plan(
 ) -> None:  # fmt: skip
     """Plan a path on the navigation grid and draw it; prints it as CSV: x,y,clearance in metres, level frame.
 
-    The level frame's origin is below the first camera, x its heading, z up. What was never seen counts as blocked.
+    The level frame's origin is below the first camera, x its heading, z up. Cells that were never seen count as blocked.
 
     \b
       slamcli plan --start first --goal last

@@ -13,13 +13,13 @@ from slamcli.cli.common import Target, json_option
 @click.command("localize", short_help="Find a new recording's camera in the map of an old run.")
 @click.argument("run")
 @click.argument("recording")
-@click.option("--out", default="localized.txt", show_default=True, type=Target(), help="TUM trajectory.")
+@click.option("--out", default="localized.txt", show_default=True, type=Target(), help="Where the trajectory goes (TUM format).")
 @click.option("--data", metavar="DIR", help="Folder of recordings. [default: $SLAMCLI_DATA, ./data, the user's cache]")
 @json_option
 def localize(run: str, recording: str, out: Path, data: str | None, as_json: bool) -> None:
     """Find the camera of RECORDING in the map of RUN, a run directory, and write its trajectory in that run's world frame.
 
-    The map is not changed. Frames that show nothing of it have no pose; how many have one is said.
+    The map is not changed. Frames that show nothing of it have no pose; the command says how many have one.
 
     \b
       slamcli localize runs/tum/fr1_room path/to/next/day --out next_day.txt

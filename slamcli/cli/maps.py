@@ -52,7 +52,7 @@ def export_cloud(out: Path, run: str | None, frame: str) -> None:
 @click.command("export-octree")
 @out_argument
 @run_option
-@click.option("--colour", is_flag=True, help="Give occupied leaves the cloud's colours: a ColorOcTree (.ot alone).")
+@click.option("--colour", is_flag=True, help="Give occupied leaves the cloud's colours: a ColorOcTree (only .ot).")
 def export_octree(out: Path, run: str | None, colour: bool) -> None:
     """Write the octree to OUT for OctoMap and octovis: .bt (free or occupied, small) or .ot (with probabilities).
 
@@ -87,9 +87,9 @@ def _export_colour_octree(out: Path, folder: RunDir) -> None:
 @run_option
 @click.option("--voxel", type=click.FloatRange(0.002, 0.5), default=0.02, show_default=True, help="Resolution of the surface [m].")
 @click.option(
-    "--min-area", type=click.FloatRange(0.0), default=0.01, show_default=True, help="Loose parts that are smaller are left out [m2]."
+    "--min-area", type=click.FloatRange(0.0), default=0.01, show_default=True, help="Loose parts smaller than this are left out [m2]."
 )
-@click.option("--triangles", type=click.IntRange(4), help="Decimate to at most so many.")
+@click.option("--triangles", type=click.IntRange(4), help="Decimate to at most this many.")
 @click.option(
     "--even-colours/--raw-colours", default=None, help="Even out exposure and white balance. [default: the run's densify.even_colours]"
 )
@@ -144,9 +144,18 @@ def _mesh(folder: RunDir, voxel: float, even_colours: bool | None) -> Mesh:
 @out_argument
 @run_option
 @click.option("--what", type=click.Choice(["cloud", "octree"]), default="cloud", show_default=True, help="What to draw.")
-@click.option("--azimuth", type=float, default=235.0, show_default=True, help="Where the camera stands, from x towards y [degrees].")
-@click.option("--elevation", type=click.FloatRange(-89, 89), default=42.0, show_default=True, help="How high it stands [degrees].")
-@click.option("--size", type=(click.IntRange(16, 8192), click.IntRange(16, 8192)), default=(1280, 960), help="[px]; default: 1280 960.")
+@click.option(
+    "--azimuth", type=float, default=235.0, show_default=True, help="Direction in which the camera stands, from x towards y [degrees]."
+)
+@click.option(
+    "--elevation", type=click.FloatRange(-89, 89), default=42.0, show_default=True, help="Height of the camera above the horizon [degrees]."
+)
+@click.option(
+    "--size",
+    type=(click.IntRange(16, 8192), click.IntRange(16, 8192)),
+    default=(1280, 960),
+    help="Width and height [px]; default: 1280 960.",
+)
 @click.option("--path/--no-path", "with_path", default=False, help="Also draw the camera's path.")
 def render_command(out: Path, run: str | None, what: str, azimuth: float, elevation: float, size: tuple[int, int], with_path: bool) -> None:
     """Draw the cloud or the octree to OUT (.png), from outside through the near walls. Needs no display.

@@ -11,10 +11,10 @@ import click
 from slamcli.cli.common import json_option, recording_options
 
 
-@click.command("formats", short_help="List the layouts of recordings that open, and how each is told.")
+@click.command("formats", short_help="List the layouts of recordings that open, and how each is recognised.")
 @json_option
 def formats(as_json: bool) -> None:
-    """List the layouts of recordings that open, and what tells each.
+    """List the layouts of recordings that open, and how each is recognised.
 
     A layout marked with an extra needs more than a plain install, such as: pip install 'slamcli[video]'
     """
@@ -37,7 +37,7 @@ def formats(as_json: bool) -> None:
 def convert(recording: str, out: Path, data: str | None, selection: dict[str, Any]) -> None:
     """Write RECORDING, of any layout that opens, into the new folder OUT in the TUM layout: lists, PNG images, camera.toml, truth.
 
-    Depth is written registered to colour, 5000 units a metre. Frames whose colour cannot be read are left out.
+    Depth is written registered to colour, 5000 units per metre. Frames whose colour cannot be read are left out.
 
     \b
       slamcli convert walk.mcap walk --start 10 --end 60

@@ -23,7 +23,7 @@ STAGE = click.Choice(NAMES)
 @click.command("run")
 @click.argument("target", required=False, shell_complete=complete_target)
 @click.option("-r", "--run", metavar="DIR", help="Where the run goes. [default: $SLAMCLI_RUN, else runs/<recording>]")
-@click.option("--data", metavar="DIR", help="Where recordings lie. [default: $SLAMCLI_DATA, else ./data]")
+@click.option("--data", metavar="DIR", help="Folder of recordings. [default: $SLAMCLI_DATA, else ./data]")
 @recording_options
 @config_option
 @set_option
@@ -47,7 +47,7 @@ def run_command(
 
     TARGET is a recording: `demo` for a simulated room, a folder or file of any layout that `slamcli formats` lists, or a name such as
     `tum/fr1_room`, which is downloaded when it is not found. Without TARGET an existing run goes on. Prints the run directory; with
-    --json what was made and how good the map is.
+    --json also what was made and how good the map is.
 
     \b
       slamcli run demo
@@ -214,12 +214,12 @@ def config_command(
     names: tuple[str, ...], run: str | None, config_name: str | None, assignments: tuple[str, ...], defaults: bool, explain: bool,
     changed: bool, as_json: bool,
 ) -> None:  # fmt: skip
-    """Show the configuration of the run as TOML; of a run to be, where there is none yet.
+    """Show the configuration of the run as TOML, or where there is no run yet, of a new one.
 
     \b
       slamcli config --changed
       slamcli config --explain track
-      slamcli config --explain floor         every option that has to do with it
+      slamcli config --explain floor         every option about it
       slamcli config extract.features
     """
     from slamcli.config import toml

@@ -42,14 +42,16 @@ def _row(one: Listed) -> list[str]:
     ]
 
 
-@click.command("clean", short_help="Delete what only stages read, and keep the results.")
+@click.command("clean", short_help="Delete the files that only stages read, and keep the results.")
 @run_option
-@click.option("--keep", type=click.Choice(["results"]), required=True, help="results: trajectory, cloud, octree, grid, pose graph.")
+@click.option(
+    "--keep", type=click.Choice(["results"]), required=True, help="What stays; results: trajectory, cloud, octree, grid, pose graph."
+)
 @json_option
 def clean_command(run: str | None, keep: str, as_json: bool) -> None:
     """Delete a run's features, matches and maps before loop closing; trajectory, cloud, octree, grid and pose graph stay.
 
-    Exports of these, and plan, go on working. slamcli run makes again what is deleted, from the recording.
+    Exports of these, and plan, go on working. slamcli run makes the deleted stages again, from the recording.
 
     \b
       slamcli clean --keep results -r runs/demo
@@ -70,10 +72,10 @@ def clean_command(run: str | None, keep: str, as_json: bool) -> None:
 @click.command("archive", short_help="Pack a run into one zip file.")
 @click.argument("out", type=Target())
 @run_option
-@click.option("--results", is_flag=True, help="Leave out what only stages read.")
+@click.option("--results", is_flag=True, help="Leave out the files that only stages read.")
 @json_option
 def archive_command(out: Path, run: str | None, results: bool, as_json: bool) -> None:
-    """Pack a run into OUT (.zip), whole or its results alone; unpacked anywhere it is a run again.
+    """Pack a run into OUT (.zip), whole or only its results; unpacked anywhere, it is a run again.
 
     \b
       slamcli archive demo.zip --results -r runs/demo

@@ -8,37 +8,43 @@ import click
 
 @click.command(short_help="Render a simulated recording with exact truth.")
 @click.argument("out", type=click.Path(path_type=Path))
-@click.option("--seed", default=0, show_default=True, help="Another seed is another room.")
-@click.option("--frames", type=int, help="Images to take. [default: 360; with --speed or --turn-rate what the drive needs]")
+@click.option("--seed", default=0, show_default=True, help="Each seed gives another room.")
+@click.option("--frames", type=int, help="Images to take. [default: 360; with --speed or --turn-rate as many as the drive needs]")
 @click.option("--laps", default=1.09, show_default=True, help="Rounds driven; more than 1 closes the loop.")
 @click.option("--speed", type=float, help="Top speed [m/s]. [default: 0.6]")
 @click.option("--turn-rate", type=float, help="Top turn rate [rad/s]. [default: 0.8]")
-@click.option("--rate", default=15.0, show_default=True, help="Images a second.")
-@click.option("--width", default=640, show_default=True, help="[px]")
-@click.option("--height", default=480, show_default=True, help="[px]")
-@click.option("--field-of-view", default=62.7, show_default=True, help="Horizontal [degrees].")
-@click.option("--camera-height", default=0.75, show_default=True, help="[m]")
-@click.option("--pitch", default=-12.0, show_default=True, help="Of the camera [degrees]; 27 sees no floor.")
-@click.option("--noise", type=click.Choice(["kinect", "none"]), default="kinect", show_default=True, help="none: exact images.")
+@click.option("--rate", default=15.0, show_default=True, help="Images per second.")
+@click.option("--width", default=640, show_default=True, help="Of the images [px].")
+@click.option("--height", default=480, show_default=True, help="Of the images [px].")
+@click.option("--field-of-view", default=62.7, show_default=True, help="Horizontal field of view [degrees].")
+@click.option("--camera-height", default=0.75, show_default=True, help="Above the floor [m].")
+@click.option("--pitch", default=-12.0, show_default=True, help="The camera's pitch, up [degrees]; at 27 it sees no floor.")
+@click.option(
+    "--noise",
+    type=click.Choice(["kinect", "none"]),
+    default="kinect",
+    show_default=True,
+    help="kinect: noise as a Kinect has; none: exact images.",
+)
 @click.option("--depth-min", default=0.4, show_default=True, help="Nearest reading of the noisy camera [m].")
 @click.option("--depth-max", default=5.0, show_default=True, help="Farthest reading of the noisy camera [m].")
 @click.option("--textured", default=1.0, show_default=True, help="Share of objects and walls with a picture; 0 = plain colours, shaded.")
-@click.option("--dark", is_flag=True, help="No lamp: nothing but noise in the colour images; depth brings its own light.")
+@click.option("--dark", is_flag=True, help="No lamp: the colour images hold noise only, the depth camera has its own light.")
 @click.option("--moved-object", "movable", is_flag=True, help="A parcel is taken away half-way.")
-@click.option("--people", type=click.IntRange(0, 20), default=0, show_default=True, help="Figures that walk about in view.")
+@click.option("--people", type=click.IntRange(0, 20), default=0, show_default=True, help="How many figures walk about in view.")
 @click.option(
     "--activity",
     "activities",
     multiple=True,
     type=click.Choice(["beside", "cross", "stand", "approach", "sit", "carry"]),
-    help="What they do, in turn; may be repeated. [default: all of these]",
+    help="What the figures do, in turn; may be repeated. [default: all of these]",
 )
 @click.option(
     "--alias", type=click.Choice(["posters", "corridor"]), default=None, help="Places that look alike: opposite walls, equal doors."
 )
 @click.option("--room", type=(float, float), default=(8.0, 5.0), show_default=True, help="Sides of the room [m].")
 @click.option("--trajectory", type=click.Path(path_type=Path), help="Follow a TUM trajectory instead; the room is made large enough.")
-@click.option("--stamps", type=click.Path(path_type=Path), help="Colour and depth stamps for --trajectory, two a line.")
+@click.option("--stamps", type=click.Path(path_type=Path), help="Colour and depth stamps for --trajectory, two per line.")
 def simulate(out: Path, frames: int | None, speed: float | None, turn_rate: float | None, alias: str | None, **settings: Any) -> None:
     """Render a furnished room and a drive through it into the new folder OUT.
 

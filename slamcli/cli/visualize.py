@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 BAR = 30  # characters of the longest bar in a histogram
 
 
-@click.command("inspect", short_help="Say what is wrong with a recording before time is spent on it.")
+@click.command("inspect", short_help="Find what is wrong with a recording before time is spent on it.")
 @click.argument("recording")
 @click.option("--data", metavar="DIR", help="Folder of recordings. [default: $SLAMCLI_DATA, ./data, the user's cache]")
 @click.option(
@@ -26,9 +26,9 @@ BAR = 30  # characters of the longest bar in a histogram
 @recording_options
 @json_option
 def inspect_command(recording: str, data: str | None, depth_scale: float | None, as_json: bool, selection: dict[str, Any]) -> None:
-    """Say what is wrong with a recording before time is spent on it.
+    """Find what is wrong with a recording before time is spent on it.
 
-    Every image is read once. Exit status 1 where a run would not make sense.
+    Every image is read once. The exit status is 1 if a run would not make sense.
     """
     from slamcli import console, inspection
     from slamcli.config import toml
@@ -85,12 +85,14 @@ def _facts(facts: dict) -> list[str]:
 
 @click.command(short_help="Write one HTML page about a run.")
 @run_option
-@click.option("-o", "--out", type=Target(own="report.html"), help="The page. [default: report.html in the run directory]")
-@click.option("--inspect/--no-inspect", "with_inspection", default=True, help="Look through the recording for faults, once a recording.")
+@click.option("-o", "--out", type=Target(own="report.html"), help="Where the page goes. [default: report.html in the run directory]")
+@click.option(
+    "--inspect/--no-inspect", "with_inspection", default=True, help="Look through the recording for faults; done once per recording."
+)
 def report(run: str | None, out: Path | None, with_inspection: bool) -> None:
     """Write one HTML page about a run: trajectory, errors, maps, timings, warnings, configuration.
 
-    The page needs nothing but itself: no network, no folder beside it.
+    The page is one file: it needs no network and no folder beside it.
     """
     from slamcli import report as report_page
     from slamcli.evaluation.trajectory_error import last_stage

@@ -24,14 +24,20 @@ def vocab() -> None:
 @vocab.command(short_help="Train a vocabulary on pictures and recordings.")
 @click.argument("out", type=Target())
 @click.argument("sources", nargs=-1, required=True)
-@click.option("--branching", type=click.IntRange(2, 20), default=12, show_default=True, help="Children of a node.")
+@click.option("--branching", type=click.IntRange(2, 20), default=12, show_default=True, help="Children of each node.")
 @click.option("--depth", type=click.IntRange(1, 10), default=4, show_default=True, help="Levels; words are at most branching^depth.")
-@click.option("--features", type=click.IntRange(50, 20000), default=2000, show_default=True, help="Key points taken of a picture.")
-@click.option("--every", type=click.IntRange(1), default=10, show_default=True, help="Take each so many-th frame of a recording.")
+@click.option("--features", type=click.IntRange(50, 20000), default=2000, show_default=True, help="Key points per picture.")
+@click.option("--every", type=click.IntRange(1), default=10, show_default=True, help="Use every N-th frame of a recording.")
 @click.option("--min-size", type=click.IntRange(1), default=4, show_default=True, help="Clusters smaller than twice this are not split.")
 @click.option("--iterations", type=click.IntRange(1), default=10, show_default=True, help="Rounds of k-means at most.")
-@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Same pictures and seed: same file.")
-@click.option("--origin", default="", help="What it was trained on, kept in the file. [default: the names of the sources]")
+@click.option(
+    "--seed",
+    type=click.IntRange(0),
+    default=0,
+    show_default=True,
+    help="Of the random numbers: the same pictures and seed give the same file.",
+)
+@click.option("--origin", default="", help="Description of what it was trained on, kept in the file. [default: the names of the sources]")
 def train(
     out: Path,
     sources: tuple[str, ...],
@@ -98,11 +104,11 @@ def export(out: Path, vocabulary: Path | None) -> None:
     click.echo(f"{out}: {made.n_words} words, {out.stat().st_size / 1e6:.1f} MB")
 
 
-@vocab.command(short_help="Say what a vocabulary is.")
+@vocab.command(short_help="Show what a vocabulary holds.")
 @click.argument("vocabulary", metavar="[VOCABULARY]", type=click.Path(path_type=Path, dir_okay=False), required=False)
 @json_option
 def info(vocabulary: Path | None, as_json: bool) -> None:
-    """Say what VOCABULARY (.npz), or the shipped one, holds and what it was trained on."""
+    """Show what VOCABULARY (.npz), or the shipped one, holds and what it was trained on."""
     import numpy as np
 
     from slamcli.formats import vocabulary_file
