@@ -26,21 +26,21 @@ def option(
 
 @dataclass(frozen=True)
 class RunConfig:
-    """How a run is carried out; nothing here changes a result, and no stage declares it."""
+    """How a run is carried out. No stage declares it."""
 
     workers: int = option(2, "threads that decode and extract", ge=1, le=64)
 
 
 @dataclass(frozen=True)
 class RecordingConfig:
-    """Which part of the recording is used, and how what it does not say is filled in; no stage declares it: it changes the recording."""
+    """Which part of the recording is used, and what stands in for what it lacks. No stage declares it: it changes the recording."""
 
     start: float = option(0.0, "time after the first frame at which to begin [s]", ge=0)
     end: float = option(0.0, "time after the first frame at which to stop; 0 = never [s]", ge=0)
     every: int = option(1, "use every n-th frame", ge=1)
     fps: float = option(0.0, "frame rate of a recording without stamps; 0 = 30 [Hz]", ge=0, le=1000)
     known_camera: str = option("", 'known camera whose nominal intrinsics are used, such as "d435"; "" = the recording\'s own')
-    full_size: bool = option(False, "use pictures of more than a megapixel whole, not reduced to about 640 px")
+    full_size: bool = option(False, "use pictures of more than a megapixel at full size, not at about 640 px")
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class SensorConfig:
 
 @dataclass(frozen=True)
 class ExtractConfig:
-    """Spread-out ORB features."""
+    """Evenly spread ORB features."""
 
     features: int = option(1000, "key points wanted per frame", ge=50, le=20000)
     levels: int = option(
@@ -121,7 +121,7 @@ class ExtractConfig:
 
 @dataclass(frozen=True)
 class MatchConfig:
-    """Words and frame-to-frame matches."""
+    """Visual words, and matches between neighbouring frames."""
 
     method: str = option(
         "words",
@@ -136,12 +136,12 @@ class MatchConfig:
         ge=-1,
         le=256,
     )
-    window: int = option(1, "frames before it that each frame is matched to", ge=1, le=30)
+    window: int = option(1, "how many frames before it each frame is matched with", ge=1, le=30)
     max_distance: int = option(64, "descriptors farther apart are no match [bits]", ge=0, le=256)
     ratio: float = option(0.8, "the nearest must be closer than this share of the second nearest's distance", gt=0, le=1)
-    check_rotation: bool = option(True, "keep only matches whose turn agrees with most others'")
+    check_rotation: bool = option(True, "keep only matches whose rotation agrees with that of most others")
     flow_below: int = option(100, "with fewer matches, those of optical flow are added, if extract.flow is on", ge=0)
-    flow_radius: float = option(2.0, "how near to a key point the flow of its partner ends [px]", gt=0)
+    flow_radius: float = option(2.0, "distance from a key point within which its partner's flow must end [px]", gt=0)
 
 
 @dataclass(frozen=True)
@@ -161,7 +161,7 @@ class TrackConfig:
     segment_after: int = option(10, "frames lost in a row at which a new map segment begins; 0 = never", ge=0)
     key_frame_share: float = option(0.6, "a frame that holds less of its reference key frame's landmarks becomes one", gt=0, le=1)
     key_frame_gap: int = option(8, "frames between key frames at most", ge=1)
-    key_frame_crowd: int = option(12, "no key frame where so many stand within 0.1 m and 6 degrees already", ge=1)
+    key_frame_crowd: int = option(12, "no key frame where this many stand within 0.1 m and 6 degrees already", ge=1)
     depth_icp_below: int = option(150, "with fewer landmarks, a frame is aligned by its depth image; 0 = without any", ge=0)
     depth_icp_hold: float = option(1.0, "how long motion continues in directions that depth leaves open, as along a wall [s]", ge=0, le=10)
     moving_objects: bool = option(True, "find what moves, such as people; poses and maps rest on what stands still")
@@ -197,12 +197,12 @@ class OptimizeConfig:
         False,
         "find the offset of inverse depth, as of a constant error of disparity",
     )
-    rounds: int = option(2, "turns of adjusting the map and finding those numbers", ge=1, le=10)
-    timing_prior: float = option(0.02, "how far from 0 readout times and delay are believed to be before looking [s]", gt=0, le=1)
+    rounds: int = option(2, "rounds of adjusting the map and finding those numbers", ge=1, le=10)
+    timing_prior: float = option(0.02, "standard deviation of readout times and delay around 0 [s]", gt=0, le=1)
     focal_prior: float = option(0.02, "standard deviation of the calibration's focal lengths, as a share of them", gt=0, le=1)
-    centre_prior: float = option(5.0, "how far the principal point is believed to be from the recording's calibration [px]", gt=0, le=1000)
-    depth_scale_prior: float = option(0.02, "how far the depth scale is believed to be off, as a share of it", gt=0, le=1)
-    inverse_depth_prior: float = option(0.02, "how far the offset of inverse depth is believed to be off [1/m]", gt=0, le=1)
+    centre_prior: float = option(5.0, "standard deviation of the calibration's principal point [px]", gt=0, le=1000)
+    depth_scale_prior: float = option(0.02, "standard deviation of the depth scale, as a share of it", gt=0, le=1)
+    inverse_depth_prior: float = option(0.02, "standard deviation of the offset of inverse depth [1/m]", gt=0, le=1)
 
 
 @dataclass(frozen=True)
@@ -215,7 +215,7 @@ class LoopConfig:
     min_score: float = option(0.32, "similarity of word vectors that always makes a candidate; [Z] 1.3", ge=0, le=1)
     score_share: float = option(0.6, "share of the mean score of a key frame's neighbours that makes a candidate", ge=0, le=1)
     near: float = option(0.7, "key frames that look at spots this near are candidates; 0 = off [m]", ge=0)
-    min_shared: int = option(15, "key frames that share as many landmarks are joined already", ge=1)
+    min_shared: int = option(15, "key frames that share this many landmarks are joined already", ge=1)
     min_matches: int = option(20, "matches under the same words that a candidate needs", ge=4)
     min_inliers: int = option(45, "landmarks found again that an accepted closure needs; [Z] 1.3", ge=6)
     ransac_rounds: int = option(300, "3-D to 3-D samples per candidate", ge=1)
@@ -225,7 +225,7 @@ class LoopConfig:
     fuse_max_distance: int = option(50, "descriptors that differ more are not one landmark [bits]", ge=1, le=256)
     edge_shared: int = option(30, "shared landmarks that make an edge of the pose graph", ge=1)
     edges_per_key_frame: int = option(10, "edges of the pose graph per key frame at most, closures and neighbours aside", ge=1)
-    closure_spacing: int = option(10, "no second closure is sought within so many key frames of one", ge=0)
+    closure_spacing: int = option(10, "no second closure is sought within this many key frames of one", ge=0)
     iterations: int = option(20, "rounds of each global bundle adjustment at most", ge=1)
     join_closures: int = option(2, "closures that must agree on how two map segments lie before these are joined", ge=1)
     main_segment: int = option(0, "map segment that the maps are made of; 0 = the largest", ge=0)
@@ -252,7 +252,7 @@ class SurfaceConfig:
     noise_quadratic: float = option(0.0019, "growth of a reading's sigma with (z - 0.4 m)^2 [1/m]", ge=0)
     edge: int = option(2, "readings at most this far from a depth jump are dropped [px]", ge=1, le=20)
     window: float = option(2.0, "half width of the smoothing window, per metre of distance [px/m]", ge=0, le=20)
-    max_angle_deg: float = option(78.0, "surfaces seen more slantingly are dropped [degrees from the normal]", gt=0, lt=90)
+    max_angle_deg: float = option(78.0, "surfaces seen at a larger angle to the normal are dropped [degrees]", gt=0, lt=90)
 
 
 @dataclass(frozen=True)
@@ -266,12 +266,12 @@ class DensifyConfig(SurfaceConfig):
     even_colours: bool = option(False, "even out exposure and white balance of key frames; reads every image twice")
     min_points: int = option(1, "voxels with fewer readings are dropped", ge=1)
     neighbours: int = option(6, "stray points are found by their mean distance to this many neighbours; 0 keeps all", ge=0, le=100)
-    max_deviation: float = option(2.0, "points whose mean distance is so many standard deviations above average are dropped", gt=0)
+    max_deviation: float = option(2.0, "points whose mean distance is this many standard deviations above average are dropped", gt=0)
 
 
 @dataclass(frozen=True)
 class GroundConfig:
-    """The floor."""
+    """How the floor is found."""
 
     method: str = option("robust", "lowest horizontal plane, or the paper's frequent gradients and RANSAC", choices=("robust", "paper"))
     stride: int = option(8, "side of the blocks of pixels that are averaged to one point [px]", ge=1, le=64)
@@ -294,7 +294,7 @@ class OctreeConfig(SurfaceConfig):
     resolution: float = option(0.05, "leaf side [m]", gt=0, le=10)
     frames: str = option(
         "auto",
-        "whose depth is inserted: key frames', all, or also that of frames where something vanished",
+        "frames inserted: key frames, all, or key frames and those where something vanished",
         choices=("auto", "key", "all"),
     )
     stride: int = option(4, "every stride-th row and column of a depth image is used", ge=1, le=64)
@@ -315,9 +315,9 @@ class GridConfig:
     band_low: float = option(0.05, "the robot drives over what is lower [m]", ge=0, le=10)
     band_high: float = option(0.5, "the robot's height: what is higher is passable [m]", gt=0, le=100)
     drop: float = option(0.08, "an edge: a cell through whose floor something this much deeper was seen [m]", gt=0, le=10)
-    spacing: float = option(0.12, "a frame is used when the camera moved so far since the last one [m]", gt=0)
-    spacing_deg: float = option(12.0, "a frame is used when the camera turned so far since the last [degrees]", gt=0, le=180)
-    stride: int = option(2, "every so many pixels of depth are used [px]", ge=1, le=64)
+    spacing: float = option(0.12, "a frame is used when the camera has moved this far since the last [m]", gt=0)
+    spacing_deg: float = option(12.0, "a frame is used when the camera has turned this far since the last [degrees]", gt=0, le=180)
+    stride: int = option(2, "every stride-th row and column of a depth image is used", ge=1, le=64)
     min_range: float = option(0.3, "nearer readings are ignored [m]", ge=0)
     max_range: float = option(4.0, "farther readings are ignored [m]", gt=0, le=100)
     extend_down: bool = option(True, "an upright surface that leaves the picture downwards is taken to reach the floor")
@@ -347,7 +347,7 @@ class RobotConfig:
 class Config:
     """Every section."""
 
-    seed: int = option(0, "of every random draw: the same seed gives the same bytes", ge=0, le=2**63 - 1)
+    seed: int = option(0, "seed of every random draw: the same seed gives the same bytes", ge=0, le=2**63 - 1)
     camera: dict[str, float | str] = field(default_factory=dict)  # what of the recording's calibration is overridden: keys of Camera
     run: RunConfig = field(default_factory=RunConfig)
     recording: RecordingConfig = field(default_factory=RecordingConfig)
