@@ -110,8 +110,8 @@ def _field(name: str) -> dataclasses.Field:
 def artefacts_page() -> Iterator[str]:
     """Return the lines of the page of artefacts."""
     yield f"# Artefacts\n\n{NOTE}"
-    yield "Beside the standard files, a stage's folder holds one plain `.npy` file an array. The names are those of the fields below; `numpy.load` reads each."
-    yield f"This is format {schema.FORMAT}; a run of another one is told to run again. {_sentence(schema.__doc__)} {PAPERS}\n"
+    yield "Beside the standard files, a stage's folder holds one plain `.npy` file per array, named as the fields below; `numpy.load` reads each."
+    yield f"This is format {schema.FORMAT}; a run of another format has to be made again. {_sentence(schema.__doc__)} {PAPERS}\n"
     for record in _records():
         yield f"## {record.__name__}\n\n{inspect.getdoc(record)}\n"
         yield "| array | type | shape | meaning |\n|---|---|---|---|"

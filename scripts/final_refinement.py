@@ -1,10 +1,10 @@
 #!/usr/bin/env python
-"""What hindsight is worth: poses as they are known when the last loop is closed, and as the second look leaves them.
+"""Measure what the final refinement is worth: poses as they are known when the last loop is closed, and as it leaves them.
 
-    python scripts/hindsight.py RUN [RUN ...]
+    python scripts/final_refinement.py RUN [RUN ...]
 
-Each RUN holds a finished loop stage, and its recording a ground truth. Before: loop is run again without its second look, and frames hang
-on their key frames as track hung them. Where no loop was closed, the second look is that of optimize. Only frames that have a pose in both
+Each RUN holds a finished loop stage, and its recording a ground truth. Before: loop is run again without its final refinement, and frames hang
+on their key frames as track hung them. Where no loop was closed, the final refinement is that of optimize. Only frames that have a pose in both
 are compared.
 """
 
