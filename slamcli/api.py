@@ -19,6 +19,7 @@ from slamcli.config import toml
 from slamcli.config.options import Config
 from slamcli.config.toml import Settings
 from slamcli.console import Progress, Tell, log_file, silent
+from slamcli.errors import SlamError
 from slamcli.runs.pipeline import Pipeline
 from slamcli.runs.run_directory import RunDir, default_path
 from slamcli.runs.staleness import State
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
     from slamcli.formats.cloud import Points
     from slamcli.geometry.camera import Camera
     from slamcli.geometry.octree import Octree
+    from slamcli.navigation.floor_plan import FloorPlan
     from slamcli.schema import Grid, Ground, Trajectory
 
 __all__ = ["Run", "open_run", "run"]
@@ -197,6 +199,15 @@ class Run:
         from slamcli.schema import Grid
 
         return self.directory.load(Grid, "grid2d")
+
+    def floor_plan(self, *, wall_height: float = 1.2, door_width: float = 1.2, least_area: float = 1.0) -> "FloorPlan":
+        """Draw the floor plan: walls that reach up to `wall_height` [m], rooms, and doors up to `door_width` [m] between them."""
+        from slamcli.navigation.floor_plan import make_floor_plan
+
+        xyz, _, normal = self.cloud()
+        if normal is None:
+            raise SlamError(f"{self.path}: the cloud has no normals, which walls are found by")
+        return make_floor_plan(self.grid(), xyz, normal, wall_height=wall_height, door_width=door_width, least_area=least_area)
 
     def ape(self, stage: str | None = None) -> "Ape":
         """Measure the absolute pose error after a stage (None: the last there is); SlamError without ground truth."""

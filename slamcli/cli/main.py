@@ -22,6 +22,7 @@ TOPICS = (
     "export",
     "maps",
     "grid",
+    "floor_plan",
     "visualize",
     "recordings",
     "localize",

@@ -1,5 +1,6 @@
 """Exports and pictures, from a run whose densify and octree are small and known."""
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -119,3 +120,12 @@ def test_a_run_with_an_empty_map_can_be_exported_but_not_drawn(tmp_path: Path) -
     octomap.write_bt(tmp_path / "map.bt", empty)
     with pytest.raises(SlamError, match="nothing to draw"):
         render.draw_octree(octomap.read(tmp_path / "map.bt"), view=render.View())
+
+
+def test_a_floor_plan_is_written_and_told(slamcli: Callable, known: RunDir, tmp_path: Path) -> None:
+    result = slamcli("export-plan", tmp_path / "plan.json", "-r", known.path, "--wall-height", "9", "--json")
+    assert result.exit_code == 0
+    plan = json.loads((tmp_path / "plan.json").read_text())
+    assert plan == json.loads(result.stdout) and plan["walls"] == []
+    assert f"0 walls, {len(plan['rooms'])} rooms" in result.stderr and "no wall was seen up to 9 m" in result.stderr
+    assert slamcli("export-plan", tmp_path / "plan.png", "-r", known.path).exit_code == 1

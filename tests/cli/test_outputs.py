@@ -20,6 +20,7 @@ EXPORTS = {
     "export-cloud": "cloud.ply",
     "export-octree": "map.ot",
     "export-grid": "map.pgm",
+    "export-plan": "plan.json",
     "export-mesh": "mesh.ply",
     "render": "room.png",
     "vocab export": "words.txt",

@@ -1,0 +1,147 @@
+"""Walls of a floor plan: straight lines in the vertical surfaces of a cloud, seen from above and joined at their corners.
+
+Every point votes with its own normal for the line that it would lie on (a Hough transform of oriented points: R. Duda, P. Hart,
+CACM 1972, doi:10.1145/361237.361242); the lines with the most votes are fitted to their points and cut where the wall is interrupted.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+UPRIGHT = 0.25  # |z| of the normal of a point on a wall, at most
+CELL = 0.05  # [m] one point stands for all in a cube of this side: walls seen often shall not outvote others
+N_ANGLES = 360  # of the votes, over the full turn: a wall has two faces
+DISTANCE = 0.02  # [m] step of the votes
+LEAST_VOTES = 160  # of points on one line: 0.4 m2 of wall
+# Points that a line is fitted to: within so many metres of it, and of normals with so large a cosine, again with the line found.
+FITS = ((0.06, 0.9), (0.04, 0.95), (0.03, 0.97), (0.03, 0.97))
+CLAIMED, CLAIMED_COSINE = 0.08, 0.8  # [m] points beside a line that are noise of the same wall, and vote for no other
+GAP = 0.5  # [m] an interruption from which on it is two walls
+LEAST_LENGTH = 0.6  # [m]
+LEAST_FILL = 0.5  # share of a wall's area, from its lowest to its highest point, that shows points
+FILL_CELL = 0.1  # [m] of that area's raster
+CORNER = 0.5  # [m] from the ends of two walls to where their lines meet, at most, for a corner
+CORNER_SINE = 0.5  # of the angle between them
+
+
+@dataclass(frozen=True)
+class Wall:
+    """A straight piece of wall, seen from above."""
+
+    start: np.ndarray  # (2,) m, level frame
+    end: np.ndarray  # (2,)
+    normal: np.ndarray  # (2,) unit, towards the room that it was seen from
+    top: float  # [m] of the highest points
+
+    @property
+    def length(self) -> float:
+        """Return its length [m]."""
+        return float(np.linalg.norm(self.end - self.start))
+
+
+def find_walls(xyz: np.ndarray, normal: np.ndarray, *, least_height: float) -> list[Wall]:
+    """Find the walls in a cloud, the one with the most points first.
+
+    xyz : (N, 3) [m], level frame; normal : (N, 3) unit, towards the camera
+    least_height : [m] that a wall's points reach up to, at least: furniture is lower
+    """
+    is_upright = np.abs(normal[:, 2]) < UPRIGHT
+    points, normals = _thinned(xyz[is_upright].astype(np.float64), normal[is_upright].astype(np.float64))
+    xy, facing = points[:, :2], normals[:, :2] / np.linalg.norm(normals[:, :2], axis=1, keepdims=True)
+    votes, is_left, walls = _Votes(xy, facing), np.ones(len(points), dtype=bool), []
+    while (line := votes.best(is_left)) is not None:
+        n, rho, on = _fit(xy, facing, np.flatnonzero(is_left), *line)
+        claimed = (np.abs(xy @ n - rho) < CLAIMED) & (facing @ n > CLAIMED_COSINE)
+        claimed[on] = True
+        claimed[votes.voters] = True  # so that the search ends, whatever the fit did
+        is_left &= ~claimed
+        walls += _cut(points[on], n, rho, least_height)
+    return _joined(walls)
+
+
+def _thinned(xyz: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Keep the first point of each small cube."""
+    _, first = np.unique(np.floor(xyz / CELL).astype(np.int64), axis=0, return_index=True)
+    return xyz[first], normal[first]
+
+
+class _Votes:
+    """The votes of oriented points for lines n . xy = rho."""
+
+    def __init__(self, xy: np.ndarray, facing: np.ndarray) -> None:
+        self._angle = np.round(np.arctan2(facing[:, 1], facing[:, 0]) * (N_ANGLES / (2 * np.pi))).astype(np.int64) % N_ANGLES
+        turn = 2 * np.pi / N_ANGLES * self._angle
+        distance = np.round((xy[:, 0] * np.cos(turn) + xy[:, 1] * np.sin(turn)) / DISTANCE).astype(np.int64)
+        self._least = int(distance.min(initial=0)) - 1
+        self._n_distances = int(distance.max(initial=0)) - self._least + 2
+        self._bin = self._angle * self._n_distances + distance - self._least
+        self.voters = np.empty(0, dtype=np.int64)  # points behind the last answer
+
+    def best(self, is_left: np.ndarray) -> tuple[np.ndarray, float] | None:
+        """Return the line (n, rho) with the most votes of points that are left; None where there are too few."""
+        count = np.bincount(self._bin[is_left], minlength=N_ANGLES * self._n_distances).reshape(N_ANGLES, -1)
+        around = count + np.roll(count, 1, axis=0) + np.roll(count, -1, axis=0)
+        around[:, 1:-1] = around[:, 1:-1] + around[:, :-2] + around[:, 2:]
+        angle, distance = divmod(int(np.argmax(around)), self._n_distances)
+        if around[angle, distance] < LEAST_VOTES:
+            return None
+        apart = (self._angle - angle + 1) % N_ANGLES
+        is_near = np.abs(self._bin - self._angle * self._n_distances - distance) <= 1
+        self.voters = np.flatnonzero(is_left & (apart <= 2) & is_near)
+        turn = 2 * np.pi / N_ANGLES * angle
+        return np.array([np.cos(turn), np.sin(turn)]), (distance + self._least) * DISTANCE
+
+
+def _fit(xy: np.ndarray, facing: np.ndarray, left: np.ndarray, n: np.ndarray, rho: float) -> tuple[np.ndarray, float, np.ndarray]:
+    """Fit a line to the points near it; returns its normal, its distance from the origin, and its points."""
+    on = left
+    for width, cosine in FITS:
+        is_on = (np.abs(xy[left] @ n - rho) < width) & (facing[left] @ n > cosine)
+        if np.count_nonzero(is_on) < LEAST_VOTES // 2:
+            break
+        on = left[is_on]
+        middle = xy[on].mean(axis=0)
+        across = np.linalg.eigh(np.cov((xy[on] - middle).T))[1][:, 0]
+        n = across if across @ n > 0 else -across
+        rho = float(n @ middle)
+    return n, rho, on
+
+
+def _cut(points: np.ndarray, n: np.ndarray, rho: float, least_height: float) -> list[Wall]:
+    """Cut the points (N, 3) of a line where the wall is interrupted; pieces that are too short, too low or full of holes are left out."""
+    along = np.array([-n[1], n[0]])
+    s = points[:, :2] @ along
+    order = np.argsort(s, kind="stable")
+    pieces = np.split(order, np.flatnonzero(np.diff(s[order]) > GAP) + 1)
+    walls = []
+    for piece in pieces:
+        first, last, z = s[piece[0]], s[piece[-1]], points[piece, 2]
+        low, top = np.percentile(z, [2.0, 98.0])
+        if last - first < LEAST_LENGTH or top < least_height:
+            continue
+        cells = np.unique(np.floor(np.column_stack([s[piece] - first, z - low]) / FILL_CELL), axis=0)
+        if len(cells) * FILL_CELL**2 >= LEAST_FILL * (last - first) * (top - low):
+            walls.append(Wall(rho * n + first * along, rho * n + last * along, n, float(top)))
+    return walls
+
+
+def _joined(walls: list[Wall]) -> list[Wall]:
+    """Move the ends of walls to the corners where two of them meet."""
+    ends = [[wall.start, wall.end] for wall in walls]
+    for k, wall in enumerate(walls):
+        for e, end in enumerate((wall.start, wall.end)):
+            corners = [corner for other in walls if other is not wall and (corner := _corner(wall, other)) is not None]
+            near = [corner for corner in corners if np.linalg.norm(corner - end) < CORNER]
+            if near:
+                ends[k][e] = min(near, key=lambda corner: float(np.linalg.norm(corner - end)))
+    return [replace(wall, start=start, end=end) for wall, (start, end) in zip(walls, ends, strict=True)]
+
+
+def _corner(a: Wall, b: Wall) -> np.ndarray | None:
+    """Find where the lines of two walls meet; None where they hardly do, or far from an end of either."""
+    normals = np.stack([a.normal, b.normal])
+    if abs(np.linalg.det(normals)) < CORNER_SINE:
+        return None
+    corner = np.linalg.solve(normals, np.array([a.normal @ a.start, b.normal @ b.start]))
+    is_near = [min(np.linalg.norm(corner - wall.start), np.linalg.norm(corner - wall.end)) < CORNER for wall in (a, b)]
+    return corner if all(is_near) else None
