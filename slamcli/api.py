@@ -200,14 +200,15 @@ class Run:
 
         return self.directory.load(Grid, "grid2d")
 
-    def floor_plan(self, *, wall_height: float = 1.2, door_width: float = 1.2, least_area: float = 1.0) -> "FloorPlan":
+    def floor_plan(self, *, wall_height: float = 1.2, door_width: float = 1.2) -> "FloorPlan":
         """Draw the floor plan: walls that reach up to `wall_height` [m], rooms, and doors up to `door_width` [m] between them."""
         from slamcli.navigation.floor_plan import make_floor_plan
+        from slamcli.navigation.rooms import LEAST_AREA
 
         xyz, _, normal = self.cloud()
         if normal is None:
             raise SlamError(f"{self.path}: the cloud has no normals, which walls are found by")
-        return make_floor_plan(self.grid(), xyz, normal, wall_height=wall_height, door_width=door_width, least_area=least_area)
+        return make_floor_plan(self.grid(), xyz, normal, wall_height=wall_height, door_width=door_width, least_area=LEAST_AREA)
 
     def ape(self, stage: str | None = None) -> "Ape":
         """Measure the absolute pose error after a stage (None: the last there is); SlamError without ground truth."""

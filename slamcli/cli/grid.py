@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from slamcli.navigation.planner import Route
+    from slamcli.navigation.walls import Wall
     from slamcli.runs.run_directory import RunDir
     from slamcli.schema import Grid
 
@@ -193,7 +194,8 @@ def plan(
     radius = Config().robot.radius if radius is None else radius
     if reachable:
         start, _ = _ends(grid, start, start, trajectory, radius=radius, allow_unknown=allow_unknown)
-        _tell_reachable(grid, start, radius, allow_unknown, png, as_json)
+        walls = _walls(folder) if page is None else []
+        _tell_reachable(grid, start, radius, allow_unknown, walls, png, as_json)
         return
     if goal is None:
         raise click.UsageError("give --goal, or --reachable")
@@ -210,29 +212,41 @@ def plan(
     click.echo(f"{route.length:.2f} m, never nearer than {least} to what is not free{picture}", err=True)
 
 
-def _tell_reachable(grid: Grid, start: tuple[float, float], radius: float, allow_unknown: bool, png: Path | None, as_json: bool) -> None:
-    """Print the area that a robot can get to from `start`, and draw what of the free floor it cannot."""
+def _walls(folder: RunDir) -> list[Wall]:
+    """Find the walls in the run's cloud, if it is still there."""
+    from slamcli.formats import cloud
+    from slamcli.navigation.walls import LEAST_HEIGHT, find_walls
+
+    path = folder.path / "densify" / "cloud.ply"
+    xyz, _, normal = cloud.read_ply(path) if path.exists() else (None, None, None)
+    return [] if xyz is None or normal is None else find_walls(xyz, normal, least_height=LEAST_HEIGHT)
+
+
+def _tell_reachable(
+    grid: Grid, start: tuple[float, float], radius: float, allow_unknown: bool, walls: list[Wall], png: Path | None, as_json: bool
+) -> None:
+    """Print the area that a robot can get to from `start` and the rooms that it cannot, and draw what of the free floor it cannot."""
     import numpy as np
 
-    from slamcli.navigation import cost_layers
+    from slamcli.navigation.reach import reach
     from slamcli.schema import Grid
     from slamcli.visualization.grid_picture import save_picture
 
-    cells = cost_layers.reachable(grid, start, radius=radius, allow_unknown=allow_unknown)
-    swept = cost_layers.swept(grid, cells, radius=radius)
-    area, free = float(grid.resolution) ** 2, grid.state == 0
-    told = {
-        "start": list(start),
-        "radius": radius,
-        "reachable_m2": round(float((swept & free).sum()) * area, 3),
-        "free_m2": round(float(free.sum()) * area, 3),
-    }
+    found = reach(grid, start, radius=radius, allow_unknown=allow_unknown, walls=walls)
     if png is not None:
-        seen = Grid(grid.p_occupied, grid.n_seen, np.where(free & ~swept, -1, grid.state).astype(np.int8), grid.origin, grid.resolution)
+        state = np.where((grid.state == 0) & ~found.cells, -1, grid.state).astype(np.int8)
+        seen = Grid(grid.p_occupied, grid.n_seen, state, grid.origin, grid.resolution)
         save_picture(png, seen, title=f"white: within reach of a robot of {radius:g} m radius")
+    if as_json:
+        click.echo(json.dumps({"start": list(start), "radius": radius, **found.to_dict()}))
+        return
     drawn = f"; drawn in {png}" if png else ""
-    text = f"{told['reachable_m2']:.1f} of {told['free_m2']:.1f} m2 of free floor are within reach{drawn}"
-    click.echo(json.dumps(told) if as_json else text)
+    click.echo(f"{found.reached_area:.1f} of {found.free_area:.1f} m2 of free floor are within reach{drawn}")
+    if found.rooms_left_out:
+        left = ", ".join(
+            f"room {room.number} of {room.area:.1f} m2 at {room.middle[0]:.1f},{room.middle[1]:.1f}" for room in found.rooms_left_out
+        )
+        click.echo(f"out of reach: {left}")
 
 
 def _ends(

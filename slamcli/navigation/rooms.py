@@ -12,6 +12,8 @@ import numpy as np
 from slamcli.navigation.walls import Wall
 from slamcli.schema import Grid
 
+DOOR_WIDTH = 1.2  # [m] of the widest door, if not told
+LEAST_AREA = 1.0  # [m^2] of the smallest room, likewise
 NARROWED = 0.85  # of the smaller room's half width: at a door it is narrower
 OUTLINE = 1.5  # cells that a room's outline may stray from its cells: the steps of a slanted wall
 NEIGHBOURS = ((-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1))
@@ -44,6 +46,16 @@ class Rooms:
     origin: np.ndarray  # (2,) m, level frame: the outer corner of cell (0, 0)
     rooms: list[Room]
     doors: list[Door]
+
+
+def reached_share(rooms: Rooms, grid: Grid, cells: np.ndarray) -> list[float]:
+    """Compute for each room the share of its free floor that `cells` (H, W) of the grid cover; NaN where it has none."""
+    column, row = np.rint((np.asarray(grid.origin) - rooms.origin) / float(grid.resolution)).astype(int)
+    height, width = grid.state.shape
+    label, is_free = rooms.label[row : row + height, column : column + width], np.asarray(grid.state) == 0
+    free = [np.count_nonzero(is_free & (label == room.number)) for room in rooms.rooms]
+    reached = [np.count_nonzero(is_free & cells & (label == room.number)) for room in rooms.rooms]
+    return [a / b if b else float("nan") for a, b in zip(reached, free, strict=True)]
 
 
 def find_rooms(grid: Grid, walls: list[Wall], *, door_width: float, least_area: float) -> Rooms:

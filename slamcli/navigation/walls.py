@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+LEAST_HEIGHT = 1.2  # [m] that walls reach up to, if not told
 UPRIGHT = 0.25  # |z| of the normal of a point on a wall, at most
 CELL = 0.05  # [m] one point stands for all in a cube of this side: walls seen often shall not outvote others
 N_ANGLES = 360  # of the votes, over the full turn: a wall has two faces

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from slamcli.navigation.reach import reach
 from slamcli.navigation.rooms import Rooms, find_rooms
 from slamcli.navigation.walls import Wall
 from slamcli.schema import Grid
@@ -92,3 +93,12 @@ def test_a_closet_belongs_to_the_room_it_opens_to() -> None:
 def test_a_grid_without_floor_has_no_rooms() -> None:
     rooms = found(np.full((20, 30), -1, np.int8))
     assert rooms.rooms == [] and rooms.doors == [] and not rooms.label.any()
+
+
+def test_rooms_that_a_robot_cannot_get_to_are_named() -> None:
+    grid = grid_of(flat(door=10))  # 0.5 m
+    thin, wide = (reach(grid, (2.0, 0.0), radius=radius, allow_unknown=False, walls=[]) for radius in (0.2, 0.4))
+    assert [share for _, share in thin.rooms] == pytest.approx([1.0] * 3, abs=0.02) and thin.rooms_left_out == []
+    assert [room.number for room in wide.rooms_left_out] == [1, 2]
+    assert wide.reached_area == pytest.approx(70 * 100 * CELL**2, rel=0.03) and wide.free_area == thin.free_area
+    assert [told["reached"] for told in wide.to_dict()["rooms"]] == pytest.approx([0.0, 0.0, 1.0], abs=0.03)
