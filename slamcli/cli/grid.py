@@ -58,7 +58,7 @@ def export_grid(
     out: Path, run: str | None, png: Path | None, costs: Path | None, reach: float, falloff: float, radius: float | None,
     keep_out: Path | None, mount: tuple[float, ...] | None, as_json: bool,
 ) -> None:  # fmt: skip
-    """Write the navigation grid OUT (.pgm) and its description (.yaml) beside it, for map_server and nav2.
+    """Write the navigation grid OUT (.pgm, .png or .bmp) and its description (.yaml) beside it, for map_server and nav2.
 
     The first line of the .yaml file is where the recording began: the initial pose of the camera, or with --mount that of the robot's base.
 

@@ -1,4 +1,4 @@
-"""map_server's grid map: a picture (PGM) and a YAML page beside it.
+"""map_server's grid map: a picture (PGM, PNG or BMP) and a YAML page beside it.
 
 Row 0 of the picture is the largest y; row 0 of an array here is the smallest. The flip happens in this file and nowhere else.
 """
@@ -12,6 +12,7 @@ import numpy as np
 
 from slamcli import files
 from slamcli.errors import SlamError
+from slamcli.formats.picture import encoded, read_grey
 from slamcli.schema import Grid
 
 OCCUPIED, FREE, UNKNOWN = 1, 0, -1
@@ -21,6 +22,7 @@ OCCUPIED_THRESH = 0.65
 MAX_PIXELS = 1 << 28
 MAX_PAGE = 1 << 16  # bytes of a YAML page; a real one has some 150
 PGM_WORD = re.compile(rb"#[^\n]*|[^\s#]{1,12}")
+ENDINGS = (".pgm", ".png", ".bmp")
 KEYS = ("image", "mode", "resolution", "origin", "negate", "occupied_thresh", "free_thresh")
 
 
@@ -40,13 +42,13 @@ class GridMap:
 
 
 def write(path: Path, grid: GridMap, *, start: tuple[float, float, float] | None = None) -> tuple[Path, Path]:
-    """Write `path` (.pgm) and the YAML page of the same name beside it; returns both paths.
+    """Write `path` (.pgm, .png or .bmp) and the YAML page of the same name beside it; returns both paths.
 
     start : x [m], y [m], yaw [rad] where the recording began, told in a comment of the page: a robot's initial pose
     """
     path = Path(path)
-    if path.suffix != ".pgm":
-        raise SlamError(f"{path}: a grid map's name ends in .pgm; its page map.yaml is written beside it")
+    if path.suffix not in ENDINGS:
+        raise SlamError(f"{path}: a grid map's name ends in {', '.join(ENDINGS)}; its page map.yaml is written beside it")
     picture = np.full(grid.state.shape, GREY[UNKNOWN], dtype=np.uint8)
     for state in (OCCUPIED, FREE):
         picture[grid.state == state] = GREY[state]
@@ -61,9 +63,13 @@ def write(path: Path, grid: GridMap, *, start: tuple[float, float, float] | None
         f"{told}image: {_quoted(path.name)}\nmode: trinary\nresolution: {grid.resolution!r}\norigin: [{x!r}, {y!r}, 0.0]\n"
         f"negate: 0\noccupied_thresh: {OCCUPIED_THRESH}\nfree_thresh: {FREE_THRESH}\n"
     )
+    if path.suffix == ".pgm":
+        data = b"P5\n%d %d\n255\n" % (columns, rows) + picture[::-1].tobytes()
+    else:
+        data = encoded(np.ascontiguousarray(picture[::-1]), path.suffix)
     with files.whole(path) as file, files.whole(page) as page_file:  # both are complete before either gets its name
         page_file.write(text.encode())
-        file.write(b"P5\n%d %d\n255\n" % (columns, rows) + picture[::-1].tobytes())
+        file.write(data)
     return path, page
 
 
@@ -93,7 +99,9 @@ def read(path: Path) -> GridMap:
     state_of = np.full(256, UNKNOWN, dtype=np.int8)
     state_of[occupied > occupied_thresh] = OCCUPIED
     state_of[occupied < free_thresh] = FREE
-    state = state_of[read_pgm(path.parent / keys["image"])]
+    picture = path.parent / keys["image"]
+    is_coded = picture.suffix.lower() in (".png", ".bmp")
+    state = state_of[read_grey(picture, max_pixels=MAX_PIXELS) if is_coded else read_pgm(picture)]
     return GridMap(np.ascontiguousarray(state[::-1]), (origin[0], origin[1]), resolution)
 
 

@@ -2,25 +2,17 @@
 
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from slamcli.errors import SlamError
+from slamcli.formats.picture import read_grey
 
-MAX_BYTES = 64 << 20
+MAX_PIXELS = 1 << 26
 
 
 def read_mask(path: Path, shape: tuple[int, int]) -> np.ndarray:
-    """Read a mask (H, W) bool; SlamError for what is no picture and for one of another size."""
-    try:
-        if path.stat().st_size > MAX_BYTES:
-            raise SlamError(f"{path}: too large to be a mask")
-        data = np.frombuffer(path.read_bytes(), dtype=np.uint8)
-    except OSError as error:
-        raise SlamError(f"{path}: cannot be read ({error.strerror})") from error
-    picture = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if len(data) else None
-    if picture is None:
-        raise SlamError(f"{path}: not a picture; a mask is a PNG that is not black where something is to be left out")
+    """Read a mask (H, W) bool from a PNG or BMP; SlamError for what is no picture and for one of another size."""
+    picture = read_grey(path, max_pixels=MAX_PIXELS)
     if picture.shape != shape:
         raise SlamError(f"{path}: is {picture.shape[1]} x {picture.shape[0]} px; a mask of this must have {shape[1]} x {shape[0]} px")
     return picture > 0

@@ -66,8 +66,8 @@ def test_the_page_tells_where_the_recording_began_and_with_a_mount_where_the_bas
     assert slamcli("export-grid", "map.pgm", "-r", run, "--mount", "1,2,3").exit_code == 2
 
 
-@pytest.mark.parametrize("name", ["map.png", "map", "map.PGM.txt"])
-def test_export_grid_wants_a_pgm(run, here, slamcli, name):
+@pytest.mark.parametrize("name", ["map.tif", "map", "map.PGM.txt"])
+def test_export_grid_wants_a_picture_that_map_server_reads(run, here, slamcli, name):
     result = slamcli("export-grid", name, "-r", run)
     assert result.exit_code == 1
     assert "ends in .pgm" in result.stderr

@@ -64,9 +64,10 @@ def test_the_picture_is_seen_from_above_with_y_up(tmp_path):
     state=arrays(np.int8, array_shapes(min_dims=2, max_dims=2, max_side=12), elements=st.integers(-1, 1)),
     origin=st.tuples(*[st.floats(-1e4, 1e4)] * 2),
     resolution=st.floats(1e-3, 10.0),
+    ending=st.sampled_from(grid_map.ENDINGS),
 )
-def test_what_is_written_is_read_back(tmp_path_factory, state, origin, resolution):
-    _, page = grid_map.write(tmp_path_factory.mktemp("map") / "some map.pgm", GridMap(state, origin, resolution))
+def test_what_is_written_is_read_back(tmp_path_factory, state, origin, resolution, ending):
+    _, page = grid_map.write(tmp_path_factory.mktemp("map") / f"some map{ending}", GridMap(state, origin, resolution))
     back = grid_map.read(page)
     np.testing.assert_array_equal(back.state, state)
     assert (back.origin, back.resolution) == (origin, resolution)
@@ -145,7 +146,7 @@ def test_a_page_that_is_no_page(tmp_path):
 def test_other_names_and_places_are_refused(tmp_path):
     some = GridMap(np.zeros((1, 1), np.int8), (0.0, 0.0), 0.05)
     with pytest.raises(SlamError, match=r"ends in \.pgm"):
-        grid_map.write(tmp_path / "map.png", some)
+        grid_map.write(tmp_path / "map.tif", some)
     with pytest.raises(SlamError, match="cannot be written"):
         grid_map.write(tmp_path / "nowhere" / "map.pgm", some)
 

@@ -1,0 +1,50 @@
+"""Grey pictures: back as written, and one line, within bounds, for what is none."""
+
+import struct
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from slamcli.errors import SlamError
+from slamcli.formats import picture
+
+
+@pytest.mark.parametrize("ending", [".png", ".bmp"])
+def test_a_picture_is_read_back(tmp_path: Path, ending: str) -> None:
+    grey = np.random.default_rng(0).integers(0, 256, (7, 13)).astype(np.uint8)
+    (tmp_path / f"p{ending}").write_bytes(picture.encoded(grey, ending))
+    np.testing.assert_array_equal(picture.read_grey(tmp_path / f"p{ending}", max_pixels=91), grey)
+    with pytest.raises(SlamError, match="13 x 7 pixels are too many"):
+        picture.read_grey(tmp_path / f"p{ending}", max_pixels=90)
+
+
+def huge_png() -> bytes:
+    """The header of a picture of 100000 x 100000, and little more."""
+    header = b"IHDR" + struct.pack(">IIBBBBB", 100_000, 100_000, 8, 0, 0, 0, 0)
+    return picture.PNG_MAGIC + struct.pack(">I", 13) + header + struct.pack(">I", zlib.crc32(header)) + b"IDAT"
+
+
+@pytest.mark.parametrize(
+    ("data", "says"),
+    [
+        (b"", "not a picture"),
+        (b"hello", "not a picture"),
+        (picture.PNG_MAGIC, "not a picture"),
+        (picture.BMP_MAGIC + bytes(40), "not a picture"),
+        (huge_png(), "100000 x 100000 pixels are too many"),
+        (picture.BMP_MAGIC + bytes(16) + struct.pack("<ii", -100_000, 2**31 - 1) + bytes(30), "too many"),
+        (picture.encoded(np.zeros((9, 9), np.uint8), ".png")[:40], "not a picture"),
+    ],
+)
+def test_what_is_no_picture_gives_one_line(tmp_path: Path, data: bytes, says: str) -> None:
+    (tmp_path / "p.png").write_bytes(data)
+    with pytest.raises(SlamError, match=says) as caught:
+        picture.read_grey(tmp_path / "p.png", max_pixels=1 << 24)
+    assert "p.png" in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_a_missing_picture_is_named(tmp_path: Path) -> None:
+    with pytest.raises(SlamError, match="none.png"):
+        picture.read_grey(tmp_path / "none.png", max_pixels=10)
