@@ -21,6 +21,7 @@ TOPICS = (
     "compare",
     "export",
     "maps",
+    "render",
     "grid",
     "floor_plan",
     "visualize",

@@ -1,4 +1,4 @@
-"""slamcli export-cloud, export-octree, export-mesh, render."""
+"""slamcli export-cloud, export-octree, export-mesh."""
 
 from __future__ import annotations
 
@@ -12,11 +12,8 @@ from slamcli.cli.common import Target, check_ending, run_option
 from slamcli.errors import SlamError
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from slamcli.dense.tsdf import Mesh
     from slamcli.runs.run_directory import RunDir
-    from slamcli.visualization.render import View
 
 out_argument = click.argument("out", type=Target())
 
@@ -138,63 +135,3 @@ def _mesh(folder: RunDir, voxel: float, even_colours: bool | None) -> Mesh:
     for view in densify.views(*read, console.progress(poses, "mesh"), config.sensor, option, moving=moving, workers=config.run.workers):
         volume.add(view.seen, view.evened(gains), view.T_wk)
     return volume.mesh().moved(T_lw)
-
-
-@click.command("render")
-@out_argument
-@run_option
-@click.option("--what", type=click.Choice(["cloud", "octree"]), default="cloud", show_default=True, help="What to draw.")
-@click.option(
-    "--azimuth", type=float, default=235.0, show_default=True, help="Direction in which the camera stands, from x towards y [degrees]."
-)
-@click.option(
-    "--elevation", type=click.FloatRange(-89, 89), default=42.0, show_default=True, help="Height of the camera above the horizon [degrees]."
-)
-@click.option(
-    "--size",
-    type=(click.IntRange(16, 8192), click.IntRange(16, 8192)),
-    default=(1280, 960),
-    help="Width and height [px]; default: 1280 960.",
-)
-@click.option("--path/--no-path", "with_path", default=False, help="Also draw the camera's path.")
-def render_command(out: Path, run: str | None, what: str, azimuth: float, elevation: float, size: tuple[int, int], with_path: bool) -> None:
-    """Draw the cloud or the octree to OUT (.png), from outside through the near walls. Needs no display.
-
-    \b
-      slamcli render cloud.png
-      slamcli render octree.png --what octree --azimuth 45
-    """
-    import cv2
-    import numpy as np
-
-    from slamcli import files
-    from slamcli.runs import placement
-    from slamcli.runs.run_directory import RunDir
-    from slamcli.visualization import render
-
-    check_ending(out, ".png", ".jpg")
-    folder = RunDir.find(run)
-    view = render.View(azimuth_deg=azimuth, elevation_deg=elevation, width=size[0], height=size[1])
-    path = placement.camera_path(folder) if with_path else None
-    path = None if path is None else path[np.isfinite(path[:, 0])]
-    image = (_draw_cloud if what == "cloud" else _draw_octree)(folder, view, path)
-    done, data = cv2.imencode(out.suffix.lower(), image[..., ::-1])
-    if not done:
-        raise SlamError(f"{out}: the picture cannot be encoded")
-    files.write_bytes(out, data.tobytes())
-    click.echo(f"{out}: {size[0]} x {size[1]} px", err=True)
-
-
-def _draw_cloud(folder: RunDir, view: View, path: np.ndarray | None) -> np.ndarray:
-    from slamcli.formats import cloud
-    from slamcli.visualization import render
-
-    xyz, rgb, normal = cloud.read_coloured_ply(folder.stage_path("densify", "cloud.ply"))
-    return render.draw_cloud(xyz, rgb, normal, spacing=folder.config().densify.voxel, view=view, path=path)
-
-
-def _draw_octree(folder: RunDir, view: View, path: np.ndarray | None) -> np.ndarray:
-    from slamcli.formats import octomap
-    from slamcli.visualization import render
-
-    return render.draw_octree(octomap.read(folder.stage_path("octree", "map.ot")), view=view, path=path)

@@ -46,8 +46,12 @@ def camera_poses(run: RunDir) -> np.ndarray:
 
 def camera_path(run: RunDir) -> np.ndarray:
     """Return the camera centres (F, 3) of every frame in the level frame [m], NaN where lost."""
-    T_wc = frame_poses(run.load(Tracks, "loop"), run.load(Map, "loop"))
-    return se3.transform(run.load(Ground, "densify").T_lw, T_wc[:, :3, 3])
+    return level_poses(run)[:, :3, 3]
+
+
+def level_poses(run: RunDir) -> np.ndarray:
+    """Return T_lc (F, 4, 4) of every frame, NaN where lost."""
+    return run.load(Ground, "densify").T_lw @ frame_poses(run.load(Tracks, "loop"), run.load(Map, "loop"))
 
 
 def lines(placement: Placement) -> list[tuple[str, str]]:

@@ -37,8 +37,8 @@ class View:
 
 
 @dataclass(frozen=True)
-class _Eye:
-    """A pinhole camera on the scene."""
+class Eye:
+    """A pinhole camera on the scene, `OVERSAMPLING` times finer than the picture."""
 
     R_cl: np.ndarray  # (3, 3) level to camera axes: x right, y down, z forward
     centre_l: np.ndarray  # (3,) m
@@ -54,14 +54,14 @@ class _Eye:
 
 
 def draw_cloud(
-    xyz: np.ndarray, rgb: np.ndarray, normal: np.ndarray | None, *, spacing: float, view: View, path: np.ndarray | None = None
+    xyz: np.ndarray, rgb: np.ndarray, normal: np.ndarray | None, *, spacing: float, view: View | Eye, path: np.ndarray | None = None
 ) -> np.ndarray:
     """Draw points (N, 3) with colours (N, 3) uint8 at some spacing [m]; returns (H, W, 3) uint8.
 
     normal : (N, 3); points that face away are left out. None draws all.
     path : (M, 3) positions of the camera, drawn as a line
     """
-    eye = _look_at(xyz, view)
+    eye = view if isinstance(view, Eye) else look_at(xyz, view)
     if normal is not None:
         faces = ((eye.centre_l - xyz) * normal).sum(axis=1) > 0.0
         xyz, rgb = xyz[faces], rgb[faces]
@@ -79,7 +79,7 @@ def draw_octree(
         raise SlamError("the octree has no occupied cell beside a free one: nothing to draw")
     side = tree.resolution
     centre = (cell - CENTRE + 0.5) * side
-    eye = _look_at(np.concatenate([centre - 0.5 * side, centre + 0.5 * side]), view)
+    eye = look_at(np.concatenate([centre - 0.5 * side, centre + 0.5 * side]), view)
     rgb = _height_colours(centre[:, 2])
     image, z_buffer = _canvas(eye)
     for number, direction in enumerate(FACES):
@@ -107,7 +107,7 @@ def octree_heights(tree: Octree) -> tuple[float, float]:
 
 def draw_mesh(xyz: np.ndarray, triangle: np.ndarray, rgb: np.ndarray, *, view: View, path: np.ndarray | None = None) -> np.ndarray:
     """Draw triangles (M, 3) of vertex rows, seen from their front (counter-clockwise) side; returns (H, W, 3) uint8."""
-    eye = _look_at(xyz, view)
+    eye = look_at(xyz, view)
     corner = xyz[triangle].astype(np.float64)
     normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
     towards = ((eye.centre_l - corner[:, 0]) * normal).sum(axis=1) > 0.0
@@ -120,7 +120,7 @@ def draw_mesh(xyz: np.ndarray, triangle: np.ndarray, rgb: np.ndarray, *, view: V
     return _finish(image, z_buffer, eye, path)
 
 
-def _look_at(xyz: np.ndarray, view: View) -> _Eye:
+def look_at(xyz: np.ndarray, view: View) -> Eye:
     """Place the camera so that all but a few stray points just fit into the picture."""
     if not len(xyz):
         raise SlamError("the map is empty: nothing to draw")
@@ -140,19 +140,19 @@ def _look_at(xyz: np.ndarray, view: View) -> _Eye:
     middle = middle @ R_cl
     width, height = view.width * OVERSAMPLING, view.height * OVERSAMPLING
     focal = width / 2 / np.tan(np.radians(view.field_of_view_deg) / 2)
-    return _Eye(R_cl, middle + backward * distance, focal, width, height)
+    return Eye(R_cl, middle + backward * distance, focal, width, height)
 
 
-def _canvas(eye: _Eye) -> tuple[np.ndarray, np.ndarray]:
+def _canvas(eye: Eye) -> tuple[np.ndarray, np.ndarray]:
     image = np.empty((eye.height, eye.width, 3), dtype=np.uint8)
     image[:] = BACKGROUND
     return image, np.full((eye.height, eye.width), np.inf, dtype=np.float32)
 
 
-def _finish(image: np.ndarray, z_buffer: np.ndarray, eye: _Eye, path: np.ndarray | None) -> np.ndarray:
+def _finish(image: np.ndarray, z_buffer: np.ndarray, eye: Eye, path: np.ndarray | None) -> np.ndarray:
     if path is not None and len(path):
         pixel = eye.see(np.asarray(path, dtype=np.float64))
-        line = np.rint(pixel[pixel[:, 2] > 0.0, :2]).astype(np.int32)
+        line = np.rint(pixel[pixel[:, 2] > 0.0, :2]).astype(np.int32)  # NaN, where lost, compares false
         cv2.polylines(image, [line.reshape(-1, 1, 2)], False, PATH_COLOUR, thickness=2 * OVERSAMPLING, lineType=cv2.LINE_AA)
     size = (eye.width // OVERSAMPLING, eye.height // OVERSAMPLING)
     return cv2.resize(image, size, interpolation=cv2.INTER_AREA)

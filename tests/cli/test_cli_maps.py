@@ -129,3 +129,16 @@ def test_a_floor_plan_is_written_and_told(slamcli: Callable, known: RunDir, tmp_
     assert plan == json.loads(result.stdout) and plan["walls"] == []
     assert f"0 walls, {len(plan['rooms'])} rooms" in result.stderr and "no wall was seen up to 9 m" in result.stderr
     assert slamcli("export-plan", tmp_path / "plan.png", "-r", known.path).exit_code == 1
+
+
+def test_plans_and_films_are_rendered(slamcli: Callable, known: RunDir, tmp_path: Path) -> None:
+    plan = slamcli("render", tmp_path / "plan.png", "--what", "plan", "--size", "160", "120", "--path", "-r", known.path)
+    assert plan.exit_code == 0 and "px a metre" in plan.stderr
+    height, width = cv2.imread(str(tmp_path / "plan.png")).shape[:2]
+    assert width <= 160 and height <= 120 and (width > 150 or height > 110)
+    refused = slamcli("render", tmp_path / "map.mp4", "--what", "octree", "-r", known.path)
+    assert refused.exit_code == 1 and "only the cloud is filmed" in refused.stderr
+    pytest.importorskip("av")
+    for tour in ("around", "along"):
+        film = slamcli("render", tmp_path / "film.mp4", "--tour", tour, "--seconds", "0.1", "--size", "65", "49", "-r", known.path)
+        assert film.exit_code == 0 and "3 frames of 64 x 48 px" in film.stderr
