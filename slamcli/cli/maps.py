@@ -23,7 +23,7 @@ out_argument = click.argument("out", type=Target())
 @run_option
 @click.option("--frame", type=click.Choice(["level", "world"]), default="level", show_default=True, help="level: z up, floor at z = 0.")
 def export_cloud(out: Path, run: str | None, frame: str) -> None:
-    """Write the coloured cloud to OUT: .ply and .pcd with normals, .las and .laz for surveyors' programs.
+    """Write the coloured cloud to OUT: .ply and .pcd with normals, .las, .laz and .e57 for surveyors' programs.
 
     \b
       slamcli export-cloud cloud.ply

@@ -8,6 +8,7 @@ import numpy as np
 
 from slamcli import files
 from slamcli.errors import SlamError
+from slamcli.formats.e57 import write_e57
 from slamcli.formats.las import write_las
 
 Points = tuple[np.ndarray, np.ndarray | None, np.ndarray | None]  # xyz (N, 3) float32, rgb (N, 3) uint8, normal (N, 3) float32
@@ -240,4 +241,4 @@ def _points(path: Path, columns: dict[str, np.ndarray]) -> Points:
     return xyz, rgb, normal if normal is not None else group("normal_x normal_y normal_z", np.float32)
 
 
-WRITERS: dict[str, Callable] = {".ply": write_ply, ".pcd": write_pcd, ".las": write_las, ".laz": write_las}
+WRITERS: dict[str, Callable] = {".ply": write_ply, ".pcd": write_pcd, ".las": write_las, ".laz": write_las, ".e57": write_e57}

@@ -90,7 +90,7 @@ def test_render_draws_the_map(slamcli: Callable, known: RunDir, what: str, tmp_p
 @pytest.mark.parametrize(
     ("command", "message"),
     [
-        (("export-cloud", "cloud.xyz"), "must end in .ply or .pcd or .las or .laz"),
+        (("export-cloud", "cloud.xyz"), "must end in .ply or .pcd or .las or .laz or .e57"),
         (("export-octree", "map.png"), "must end in .bt or .ot"),
         (("export-octree", "map.bt", "--colour"), "no room for colours"),
         (("export-mesh", "mesh.stl"), "must end in .glb or .obj or .ply"),
