@@ -9,7 +9,7 @@ Nothing is printed: progress goes to the `progress` of the caller, single lines 
 
 import logging
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from slamcli.geometry.octree import Octree
     from slamcli.navigation.floor_plan import FloorPlan
     from slamcli.schema import Grid, Ground, Trajectory
+    from slamcli.slam.doubt import Finding
 
 __all__ = ["Run", "open_run", "run"]
 
@@ -52,7 +53,7 @@ def run(
     force: bool = False,
     progress: Progress = silent,
     tell: Tell = log.info,
-    look: "Callable[[Dataset], None] | None" = None,
+    look: "Callable[[Dataset], Sequence[Finding]] | None" = None,
 ) -> "Run":
     """Make a run of a recording, or bring the one that is there up to date: exactly the stages that need it.
 
@@ -63,16 +64,18 @@ def run(
     data : folder of recordings to look in first
     start, until, force : run from this stage on whether up to date or not; stop after this one; run every stage
     progress : passes items through under a bar, as ``progress(items, label, total=None)``; tell : takes single lines
-    look : is given the recording before its first stage runs, to say what is wrong with it
+    look : is given the recording before its first stage runs, to say what is wrong with it; what it returns the run keeps
 
     Raises SlamError for whatever the caller can mend, such as a recording that is not there or an option that is not known.
     """
     settings = settings if isinstance(settings, Mapping) else tuple(settings)
     resolve = partial(toml.resolve, name_or_file=config, settings=settings)
     opened, dataset, resolved = create_run(str(target), resolve=resolve, path=path, data=data, progress=progress)
-    if look is not None and not Pipeline(opened, resolved, dataset=dataset).states()[NAMES[0]].is_fresh:
-        look(dataset)
-    _bring_up_to_date(opened, resolved, dataset, start=start, until=until, force=force, progress=progress, tell=tell)
+    found: Sequence[Finding] = ()
+    if look is not None and (force or start == NAMES[0] or not Pipeline(opened, resolved, dataset=dataset).states()[NAMES[0]].is_fresh):
+        found = look(dataset)
+    which: dict[str, Any] = {"start": start, "until": until, "force": force}
+    _bring_up_to_date(opened, resolved, dataset, looked=found, progress=progress, tell=tell, **which)
     return Run(opened)
 
 
@@ -278,11 +281,20 @@ def create_run(
 
 
 def _bring_up_to_date(
-    directory: RunDir, config: Config, dataset: "Dataset | None", *, progress: Progress, tell: Tell, **which: Any
+    directory: RunDir,
+    config: Config,
+    dataset: "Dataset | None",
+    *,
+    progress: Progress,
+    tell: Tell,
+    looked: "Sequence[Finding]" = (),
+    **which: Any,
 ) -> None:
     with writing(directory, config):
         directory.mark_latest()
-        Pipeline(directory, config, dataset=dataset, progress=progress, tell=tell).bring_up_to_date(**which)
+        pipeline = Pipeline(directory, config, dataset=dataset, progress=progress, tell=tell)
+        pipeline.looked = looked
+        pipeline.bring_up_to_date(**which)
 
 
 @contextmanager

@@ -11,12 +11,15 @@ import numpy as np
 from slamcli.calibration import rolling_shutter
 from slamcli.config.options import OptimizeConfig, SensorConfig
 from slamcli.estimation import bundle_adjustment, shared_parameters
+from slamcli.estimation.shared_parameters import Shared
 from slamcli.geometry.camera import Camera
 from slamcli.schema import Features, Timing
 from slamcli.sparse_map import map_adjustment
 from slamcli.sparse_map.sparse_map import SparseMap
 
 TIMES = "readout", "depth_readout", "depth_delay"  # fields of Timing that are looked for
+# Only looked at, never corrected: the share of both focal lengths, and [px] by which depth lies off colour.
+FOCAL, SHIFTS = "focal", ("shift_x", "shift_y")
 SIGNIFICANT = 3.0  # standard deviations
 ROWS_AT_ONCE = 1 << 18  # features recalibrated together: the intermediate results of a long recording would fill the memory
 STEP = 1e-3  # of its prior sigma, by which an unknown of the calibration is moved to see what that does
@@ -73,16 +76,11 @@ def estimate_sensing(
     given : the recording's calibration; prior : as `unknowns` gives it, standard deviations of the timing around 0, of the rest around `given`
     Returns better numbers, with the same motion, those as before that do not differ significantly; None where the map is not determined.
     """
-    part = map_adjustment.gather(sparse_map, np.arange(len(sparse_map.kf), dtype=np.int32), sensor)
-    if len(part.row) == 0 or not prior:
+    asked = _ask(sparse_map, now, sensor, prior)
+    if asked is None:
         return None
-    T_kw, x_w = sparse_map.T_kw(part.kfs), sparse_map.lm.xyz[part.ids]
-    problem = bundle_adjustment.Problem(T_kw, x_w, part.seen, now.camera, part.is_fixed, part.edges)
+    problem, columns, pivot = asked
     names = list(prior)
-    predicted = problem.in_given_order(problem.predict(problem.T, problem.x))
-    # What an offset bends is to turn about readings of this depth, so that it changes no size that the depth scale answers for.
-    pivot = float(np.median(predicted[:, 2]))
-    columns = np.stack([_column(name, sparse_map.features, part.row, predicted, now, prior[name], pivot) for name in names], axis=2)
     value, centre = (
         np.array([_number(name, camera, when, pivot) for name in names]) for camera, when in ((now.camera, now.timing), (given, None))
     )
@@ -97,6 +95,34 @@ def estimate_sensing(
         better["depth_scale"] *= 1.0 - better["inverse_depth_offset"] * pivot
     when = {name: np.array(better.pop(name)) for name in TIMES if name in better}
     return Sensing(replace(now.camera, **better), replace(now.timing, **when), dict(zip(names, found.sigma.tolist(), strict=True)))
+
+
+def deviations(sparse_map: SparseMap, now: Sensing, sensor: SensorConfig, *, prior: dict[str, float]) -> Shared | None:
+    """Find by how much an adjusted map would have numbers changed, in the order of `prior`; None where the map is not determined.
+
+    prior : standard deviations around what is known now: of fields of Timing or Camera, of FOCAL and of SHIFTS
+    """
+    asked = _ask(sparse_map, now, sensor, prior)
+    if asked is None:
+        return None
+    problem, columns, _ = asked
+    return shared_parameters.estimate(problem, columns, prior=np.zeros(len(prior)), prior_sigma=np.array(list(prior.values())))
+
+
+def _ask(
+    sparse_map: SparseMap, now: Sensing, sensor: SensorConfig, prior: dict[str, float]
+) -> tuple[bundle_adjustment.Problem, np.ndarray, float] | None:
+    """Make the problem whose optimum the map is, what each unknown does to its measurements (O, 3, G), and the depth that offsets turn about."""
+    part = map_adjustment.gather(sparse_map, np.arange(len(sparse_map.kf), dtype=np.int32), sensor)
+    if len(part.row) == 0 or not prior:
+        return None
+    T_kw, x_w = sparse_map.T_kw(part.kfs), sparse_map.lm.xyz[part.ids]
+    problem = bundle_adjustment.Problem(T_kw, x_w, part.seen, now.camera, part.is_fixed, part.edges)
+    predicted = problem.in_given_order(problem.predict(problem.T, problem.x))
+    # What an offset bends is to turn about readings of this depth, so that it changes no size that the depth scale answers for.
+    pivot = float(np.median(predicted[:, 2]))
+    columns = [_column(name, sparse_map.features, part.row, predicted, now, sigma, pivot) for name, sigma in prior.items()]
+    return problem, np.stack(columns, axis=2), pivot
 
 
 def _number(name: str, camera: Camera, when: Timing | None, pivot: float) -> float:
@@ -118,6 +144,9 @@ def _column(name: str, features: Features, rows: np.ndarray, predicted: np.ndarr
     stretches their errors too, and the least errors are those of the smallest camera.
     pivot : [m] depth of readings that the offset of inverse depth leaves as they are
     """
+    if name == FOCAL:
+        focal = (("fx", now.camera.fx), ("fy", now.camera.fy))
+        return sum((value * _column(one, features, rows, predicted, now, sigma * value, pivot) for one, value in focal), np.zeros(1))
     column = np.zeros((len(rows), 3))
     if name in TIMES:
         moving = rolling_shutter.flow(features, now.timing.twist, now.camera, rows)
@@ -126,6 +155,9 @@ def _column(name: str, features: Features, rows: np.ndarray, predicted: np.ndarr
             column[:, 2] = -moving.slant_per_s * moving.share
         else:
             column[:, 2] = -moving.reading_per_s * (moving.share if name == "depth_readout" else 1.0)
+        return column
+    if name in SHIFTS:  # depth is read so far from where it belongs
+        column[:, 2] = -(predicted[:, 2] ** 2) * np.asarray(features.slope[rows, SHIFTS.index(name)], dtype=np.float64)
         return column
     if name in ("depth_scale", "inverse_depth_offset"):
         z, offset = predicted[:, 2], now.camera.inverse_depth_offset

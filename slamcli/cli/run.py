@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from slamcli.runs.placement import Placement
     from slamcli.runs.run_directory import RunDir
     from slamcli.runs.staleness import State
+    from slamcli.slam import doubt
 
 STAGE = click.Choice(NAMES)
 
@@ -127,14 +128,16 @@ def _made_object(rundir: "RunDir") -> dict[str, Any]:
     }
 
 
-def _look(dataset: "Dataset") -> None:
-    """Say what a look at a few frames shows, before time is spent on the recording."""
+def _look(dataset: "Dataset") -> "list[doubt.Finding]":
+    """Say what a look at a few frames shows, before time is spent on the recording; returns what puts its result in doubt."""
     import logging
 
     from slamcli import inspection
 
-    for finding in inspection.quick_look(dataset):
+    found = inspection.quick_look(dataset)
+    for finding in found:
         logging.getLogger("slamcli").warning("%s: %s", dataset.root, "; ".join(filter(None, (finding.message, finding.advice))))
+    return inspection.doubts(found)
 
 
 def _stage_command(stage: Stage) -> click.Command:

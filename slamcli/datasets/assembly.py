@@ -130,8 +130,10 @@ def _check_bytes(raw: np.ndarray, where: str) -> None:
 
 
 def _roughness(raw: np.ndarray) -> float:
+    """Return the median step between neighbouring readings that differ: half of them and more may be equal, whatever the order of bytes."""
     both = (raw[:, 1:] > 0) & (raw[:, :-1] > 0)
     step = np.abs(raw[:, 1:].astype(np.int32) - raw[:, :-1])[both]
+    step = step[step > 0]
     return float(np.median(step)) if len(step) else 0.0
 
 

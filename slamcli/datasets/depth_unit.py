@@ -5,6 +5,7 @@ q [1/m] = focal length x baseline x steps per pixel belongs to the camera, whate
 large the same readings show a k times smaller q. Cameras of other kinds, and depth that was resampled, show no such steps.
 """
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -25,8 +26,12 @@ CAMERAS = {
     "RealSense D455 at 1280 x 720": 1950.0,
 }
 TOLERANCE = 0.05  # by which q of one kind of camera varies
+STRANGE = 0.12  # by which q differs from all known ones where the scale is at fault: another camera of a known kind is nearer
 COMMON_SCALES = (1000.0, 5000.0, 10000.0, 4000.0, 2000.0, 256.0, 100.0, 6553.5)  # depth units per metre in use, the likelier first
 FACTORS = (4.0, 5.0, 10.0)  # by which a scale is off when it is wrong: millimetres, tenths of them, TUM's 5000, RealSense's 4000
+FINEST_WHOLE_UNIT = 50.0  # depth units per metre from which readings are whole numbers
+MILLIMETRES = 1000.0
+DEPTH_STEP = 4  # every fourth row and column of a depth image is counted
 WINDOWS = np.geomspace(100.0, 60000.0, 64)  # raw readings between which steps are looked for
 LEAST_VALUES = 5  # different readings within a window
 LEAST_WINDOWS = 5
@@ -58,6 +63,18 @@ def counted(images: Iterable[np.ndarray]) -> np.ndarray:
     return counts
 
 
+def counting_scale(depth_scale: float) -> float:
+    """Return the units per metre in which readings are counted: the recording's own, millimetres for floating-point metres."""
+    return depth_scale if depth_scale >= FINEST_WHOLE_UNIT else MILLIMETRES
+
+
+def counted_metres(depth: np.ndarray, scale: float) -> np.ndarray:
+    """Count the readings of each raw value, at `scale` units per metre, in some rows of depth (h, w) [m], NaN = none; (65536,)."""
+    some = depth[::DEPTH_STEP, ::DEPTH_STEP]
+    raw = np.rint(some[np.isfinite(some)] * scale).clip(0, DEPTH_VALUES - 1).astype(np.int64)
+    return np.bincount(raw, minlength=DEPTH_VALUES)
+
+
 def judge(counts: np.ndarray, scale: float) -> DepthUnit:
     """Judge a depth scale from the readings of each raw value, (65536,)."""
     counts = counts.copy()
@@ -78,6 +95,10 @@ def judge(counts: np.ndarray, scale: float) -> DepthUnit:
             name = _camera_of((constant or 0.0) / likely)
             reason = f"the steps between readings fit a {name} only if distances are {scale / likely:.2g} times as large"
             return DepthUnit(percentiles, q, name, likely, reason)
+        if not _is_near_a_camera(q):
+            likely = _round_scale((constant or 0.0) / KINECT)
+            reason = f"the steps between readings are those of no known camera (q = {q:.0f}/m; a Kinect or Xtion has {KINECT:.0f}/m)"
+            return DepthUnit(percentiles, q, "", likely, reason)
     return _judge_range(percentiles, q, scale)
 
 
@@ -111,6 +132,17 @@ def disparity_constant(counts: np.ndarray) -> float | None:
 
 def _camera_of(q: float) -> str:
     return next((name for name, known in CAMERAS.items() if abs(q / known - 1.0) <= TOLERANCE), "")
+
+
+def _is_near_a_camera(q: float) -> bool:
+    return any(abs(q / known - 1.0) <= STRANGE for known in CAMERAS.values())
+
+
+def _round_scale(scale: float) -> float:
+    """Round to a number that somebody would have chosen: two digits, the second a 0 or a 5 above 40."""
+    unit = 10.0 ** (math.floor(math.log10(scale)) - 1)
+    step = 5.0 if scale / unit > 40.0 else 1.0
+    return float(round(scale / unit / step) * step * unit)
 
 
 def _likely_scale(constant: float, scale: float) -> float | None:

@@ -26,14 +26,16 @@ from slamcli.inspection.findings import (
     about_lists,
     about_order,
     about_registration,
+    about_streams,
     about_unit,
     is_textured,
 )
 from slamcli.inspection.pictures import Pictures
 from slamcli.inspection.registration import Registration
 from slamcli.inspection.timing import Timing
+from slamcli.slam import doubt
 
-__all__ = ["ERROR", "NOTE", "WARNING", "Finding", "Inspection", "inspect", "quick_look"]
+__all__ = ["ERROR", "NOTE", "WARNING", "Finding", "Inspection", "doubts", "inspect", "quick_look"]
 
 QUICK_FRAMES, QUICK_BLOCKS = 30, 3  # looked at before a run: a second or two
 VERDICTS = {ERROR: "do not run it like this", WARNING: "usable, with the faults listed", NOTE: "good"}
@@ -85,7 +87,7 @@ def inspect(
         return Inspection(target, [Finding(ERROR, "opening", str(error))])
     times = timing.judge(dataset)
     seen = pictures.look(dataset, workers=workers, progress=progress)
-    unit = depth_unit.judge(seen.depth_counts, pictures.counting_scale(dataset.camera))
+    unit = depth_unit.judge(seen.depth_counts, depth_unit.counting_scale(dataset.camera.depth_scale))
     fit = registration.measure(dataset, workers=workers)
     findings = [
         *about_lists(dataset, times),
@@ -93,6 +95,7 @@ def inspect(
         *about_files(dataset, seen),
         *about_colour(seen),
         *about_depth(dataset, times, seen),
+        *about_streams(dataset, seen),
         *about_unit(dataset, unit),
         *about_registration(dataset, fit, times, is_textured=is_textured(seen)),
     ]
@@ -103,14 +106,34 @@ def quick_look(dataset: Dataset, *, workers: int = 2) -> list[Finding]:
     """Look at some frames spread over a recording and list what would spoil a run; what its opening said is not repeated."""
     frames = spread(len(dataset), QUICK_FRAMES)
     seen = pictures.look(dataset, workers=workers, progress=silent, frames=frames)
-    fit = registration.measure(dataset, workers=workers, blocks=QUICK_BLOCKS)
+    times = timing.judge(dataset)
     findings = [
         *about_files(dataset, seen),
         *about_colour(seen),
-        *about_depth(dataset, timing.judge(dataset), seen),
-        *about_registration(dataset, fit, timing.judge(dataset), is_textured=is_textured(seen)),
+        *about_depth(dataset, times, seen),
+        *_about_registration(dataset, times, is_textured=is_textured(seen), workers=workers),
     ]
-    return [finding for finding in findings if finding.level != NOTE and finding.check != "time offset"]
+    return [finding for finding in findings if finding.level != NOTE]
+
+
+def _about_registration(dataset: Dataset, times: Timing, *, is_textured: bool, workers: int) -> list[Finding]:
+    """Judge by a few stretches whether depth lies on colour; what they find, or are too few for, more of them must confirm."""
+    for blocks in (QUICK_BLOCKS, registration.BLOCKS):
+        fit = registration.measure(dataset, workers=workers, blocks=blocks)
+        found = about_registration(dataset, fit, times, is_textured=is_textured)
+        if not found and fit.n_points >= registration.LEAST_POINTS:
+            break
+    return found
+
+
+def doubts(findings: list[Finding]) -> list[doubt.Finding]:
+    """Pick the findings on a recording that put what is made of it in doubt as a whole, as a run keeps them."""
+    names = {"registration": "registration", "time offset": "depth_delay"}
+    return [
+        doubt.Finding(names[one.check], f"{one.message}: {one.advice}", is_grave=True)
+        for one in findings
+        if one.check in names and one.level != NOTE
+    ]
 
 
 def _facts(dataset: Dataset, times: Timing, seen: Pictures, unit: DepthUnit, fit: Registration) -> dict[str, Any]:

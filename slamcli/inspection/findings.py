@@ -10,6 +10,7 @@ from slamcli.inspection import pictures, timing
 from slamcli.inspection.pictures import Pictures
 from slamcli.inspection.registration import Registration
 from slamcli.inspection.timing import Timing
+from slamcli.slam import stream_doubt
 
 ERROR, WARNING, NOTE = "error", "warning", "note"
 
@@ -161,6 +162,15 @@ def about_depth(dataset: Dataset, times: Timing, seen: Pictures) -> list[Finding
     return findings
 
 
+def about_streams(dataset: Dataset, seen: Pictures) -> list[Finding]:
+    """Judge whether the images of all frames are what a camera sees: streams that stand still, depth without sense."""
+    same = (np.append(False, (taken[1:] == taken[:-1]) & (taken[1:] >= 0)) for taken in (seen.picture_sum, seen.depth_sum))
+    found = stream_doubt.about_motion(dataset.stamp, *same)
+    if any(one is not None and one.share > 0 for one in seen.readings):  # else `about_depth` says so
+        found += stream_doubt.about_readings(seen.readings)
+    return [Finding(ERROR if one.is_grave else WARNING, one.name.replace("_", " "), *one.text.split(": ", 1)) for one in found]
+
+
 def is_textured(seen: Pictures) -> bool:
     """Say whether a typical picture has enough corners for its edges to be told."""
     known = seen.corners[np.isfinite(seen.corners)]
@@ -172,7 +182,8 @@ def about_unit(dataset: Dataset, unit: DepthUnit) -> list[Finding]:
     if unit.likely_scale is None:
         return []
     message = f"the depth scale {dataset.camera.depth_scale:g} is doubtful: {unit.reason}"
-    return [Finding(ERROR, "depth scale", message, f"try: -s camera.depth_scale={unit.likely_scale:g}")]
+    level = WARNING if unit.q is not None and not unit.camera else ERROR  # a camera may be new
+    return [Finding(level, "depth scale", message, f"try: -s camera.depth_scale={unit.likely_scale:g}")]
 
 
 def about_registration(dataset: Dataset, fit: Registration, times: Timing, *, is_textured: bool) -> list[Finding]:
@@ -195,5 +206,5 @@ def about_registration(dataset: Dataset, fit: Registration, times: Timing, *, is
         findings.append(Finding(WARNING, "time offset", message, f"add {-fit.lag:+.3f} s to the stamps in the depth list"))
     elif fit.lag is None and times.depth_names_offset is not None and abs(times.depth_names_offset) > 0.02:
         message = f"the depth stamps differ from their files' names by {times.depth_names_offset:+.3f} s"
-        findings.append(Finding(WARNING, "time offset", message, "the clock of depth was moved; restore the list unless that was meant"))
+        findings.append(Finding(WARNING, "stamps", message, "the clock of depth was moved; restore the list unless that was meant"))
     return findings

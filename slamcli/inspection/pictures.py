@@ -1,5 +1,6 @@
 """One look at every image of a recording: exposure, blur, texture, depth readings, and whether the pictures follow one another."""
 
+import zlib
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -7,19 +8,17 @@ from typing import Any
 import cv2
 import numpy as np
 
-from slamcli.datasets import Dataset
+from slamcli.datasets import Dataset, depth_unit
 from slamcli.errors import BadFrame
-from slamcli.geometry.camera import DEPTH_VALUES, Camera
+from slamcli.geometry.camera import DEPTH_VALUES
 from slamcli.parallel import ordered_map
+from slamcli.slam import stream_doubt
 
 THUMBNAIL = (32, 24)  # px, width and height of the small pictures that are compared with one another
 SATURATED = 250  # grey level from which a pixel counts as burnt out
 FAST_THRESHOLD = 20  # grey levels
 BLUR_SPAN = 9 / 640  # of the picture's width; of the filter that blur is judged with
 LINE_STEP = 4  # every fourth row and column is enough to judge a whole picture
-DEPTH_STEP = 4  # likewise for depth readings
-FINEST_WHOLE_UNIT = 50.0  # depth units per metre from which readings are whole numbers
-MILLIMETRES = 1000.0
 STRANGER = 1.7  # times the difference between its neighbours: in an even motion the ratio is 0.5
 SWAPPED = 0.75  # of the difference as listed: in an even motion the ratio is 2, after a swap 0.5
 JUMP = 5.0  # times the largest difference nearby
@@ -36,8 +35,11 @@ class Pictures:
     blur: np.ndarray  # (F,) 0 sharp .. 1
     corners: np.ndarray  # (F,) FAST corners per 640 x 480 px
     thumbnail: np.ndarray  # (F, 24, 32) float32 grey levels
+    picture_sum: np.ndarray  # (F,) int64 check sum of the picture, -1 = blank or none
     holes: np.ndarray  # (F,) share of the pixels without depth
     depth_thumbnail: np.ndarray  # (F, 24, 32) float32 [1/m]
+    depth_sum: np.ndarray  # (F,) int64 check sum of the depth image, -1 = empty, of one distance, or none
+    readings: np.ndarray  # (F,) Readings, or None
     never_seen: float  # share of the pixels that have no depth in any frame
     depth_counts: np.ndarray  # (65536,) readings of each raw value
     errors: list[str]  # of the images that cannot be used
@@ -61,14 +63,10 @@ def look(dataset: Dataset, *, workers: int, progress: Progress, frames: Sequence
     return Pictures(**columns, never_seen=float(1.0 - has_seen.mean()), depth_counts=counts, errors=errors)
 
 
-def counting_scale(camera: Camera) -> float:
-    """Return the units per metre in which readings are counted: the recording's own, millimetres for floating-point metres."""
-    return camera.depth_scale if camera.depth_scale >= FINEST_WHOLE_UNIT else MILLIMETRES
-
-
 def _frame(dataset: Dataset, i: int) -> tuple[dict[str, Any], np.ndarray | None, np.ndarray | None, list[str]]:
     errors = []
     row: dict[str, Any] = dict.fromkeys(("mean_grey", "saturated", "blur", "corners", "holes"), np.nan)
+    row |= {"picture_sum": -1, "depth_sum": -1, "readings": None}
     row["thumbnail"] = row["depth_thumbnail"] = np.full(THUMBNAIL[::-1], np.nan, dtype=np.float32)
     try:
         row.update(_judge_grey(dataset.grey(i)))
@@ -84,9 +82,11 @@ def _frame(dataset: Dataset, i: int) -> tuple[dict[str, Any], np.ndarray | None,
     seen = np.isfinite(depth)
     row["holes"] = float(1.0 - seen.mean())
     row["depth_thumbnail"] = _inverse_depth_thumbnail(depth, seen)
-    some = depth[::DEPTH_STEP, ::DEPTH_STEP][seen[::DEPTH_STEP, ::DEPTH_STEP]]
-    raw = np.rint(some * counting_scale(dataset.camera)).astype(np.int64)
-    return row, seen, np.bincount(raw.clip(0, DEPTH_VALUES - 1), minlength=DEPTH_VALUES), errors
+    row["readings"] = readings = stream_doubt.look(depth)
+    if readings.spread > stream_doubt.ONE_DISTANCE:
+        row["depth_sum"] = zlib.crc32(np.ascontiguousarray(depth))
+    counts = depth_unit.counted_metres(depth, depth_unit.counting_scale(dataset.camera.depth_scale))
+    return row, seen, counts, errors
 
 
 def _judge_grey(grey: np.ndarray) -> dict[str, Any]:
@@ -96,6 +96,7 @@ def _judge_grey(grey: np.ndarray) -> dict[str, Any]:
         "saturated": float((grey >= SATURATED).mean()),
         "blur": blur_effect(grey),
         "corners": len(corners) * 640 * 480 / grey.size,
+        "picture_sum": zlib.crc32(np.ascontiguousarray(grey)) if int(grey.max()) > int(grey.min()) else -1,
         "thumbnail": cv2.resize(grey, THUMBNAIL, interpolation=cv2.INTER_AREA).astype(np.float32),
     }
 

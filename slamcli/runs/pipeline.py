@@ -6,7 +6,7 @@ import logging
 import math
 import platform
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -23,6 +23,8 @@ from slamcli.runs.cost_meter import Meter, return_free_memory
 from slamcli.runs.run_directory import RunDir
 from slamcli.runs.staleness import State
 from slamcli.schema import FORMAT
+from slamcli.slam import doubt
+from slamcli.slam.doubt import Finding
 from slamcli.stages import NAMES, STAGES, Stage, stage_named
 
 if TYPE_CHECKING:
@@ -133,6 +135,7 @@ class Pipeline:
         self.run, self.config = run, config
         self._progress, self._tell = progress, tell
         self.recording_note = ""  # why the recording could not be looked at, where it could not
+        self.looked: Sequence[Finding] = ()  # what a look at the recording found, to be kept with the first stage
         self._opened = dataset
         self._dataset_digest: str | None = None
 
@@ -229,6 +232,8 @@ class Pipeline:
                     meter.watch_compiler(self._tell)
                     run = module.run if begun is None else begun.go_on
                     summary = run(Inputs(stage, self.run, self.dataset), out, Settings(stage, self.config), tools)
+                    if stage is STAGES[0]:
+                        summary = doubt.joined(summary, self.looked)
             except (KeyboardInterrupt, SystemError) as error:
                 if (found := interruption.found_in(error)) is None:
                     raise

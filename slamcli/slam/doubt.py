@@ -12,6 +12,9 @@ import numpy as np
 
 DOUBTS = "doubts"  # key in a stage's summary
 MANY = 0.2  # share of doubtful frames from which on a run is doubtful as a whole
+# Images that are not what they should be look like a wrong calibration to the map: where the first is found, the second is no news.
+OF_IMAGES = frozenset({"frozen", "frozen_colour", "frozen_depth", "depth_readings", "depth_delay", "registration"})
+OF_CALIBRATION = frozenset({"focal_length", "principal_point", "lens", "depth_shift", "map"})
 
 
 @dataclass(frozen=True)
@@ -29,11 +32,19 @@ def to_summary(findings: Iterable[Finding]) -> dict[str, Any]:
     return {DOUBTS: found} if found else {}
 
 
+def joined(summary: Mapping[str, Any], findings: Iterable[Finding]) -> dict[str, Any]:
+    """Add findings to those that a stage's summary keeps already."""
+    added = to_summary(findings)
+    return {**summary, DOUBTS: [*summary.get(DOUBTS, []), *added[DOUBTS]]} if added else dict(summary)
+
+
 def from_records(records: Mapping[str, Mapping[str, Any] | None]) -> list[Finding]:
-    """Collect the findings of all stages' records, the grave ones first."""
+    """Collect the findings of all stages' records, the grave ones first; those that others explain are left out."""
     rows = [row for record in records.values() if record is not None for row in record.get("summary", {}).get(DOUBTS, [])]
-    findings = list(dict.fromkeys(Finding(str(row["name"]), str(row["text"]), bool(row["is_grave"])) for row in rows))
-    return sorted(findings, key=lambda finding: not finding.is_grave)
+    findings = dict.fromkeys(Finding(str(row["name"]), str(row["text"]), bool(row["is_grave"])) for row in rows)
+    is_explained = any(finding.is_grave and finding.name in OF_IMAGES for finding in findings)
+    told = [finding for finding in findings if not (is_explained and finding.name in OF_CALIBRATION)]
+    return sorted(told, key=lambda finding: not finding.is_grave)
 
 
 def verdict(findings: Iterable[Finding]) -> str:

@@ -9,15 +9,21 @@ import numpy as np
 
 from slamcli import artifacts, files
 from slamcli.config.options import Config, ExtractConfig
-from slamcli.datasets import Dataset
+from slamcli.datasets import Dataset, depth_unit
+from slamcli.datasets.recording import spread
 from slamcli.depth import at_key_points, icp
 from slamcli.errors import BadFrame, SlamError
 from slamcli.geometry.camera import Camera
 from slamcli.parallel import ordered_map
 from slamcli.schema import CoarseDepth, Features, Flow
+from slamcli.slam import doubt, stream_doubt
+from slamcli.slam.doubt import Finding
+from slamcli.slam.stream_doubt import Readings
 from slamcli.stages.camera_file import write_camera
 from slamcli.stages.contract import Inputs, Summary, Tools
 from slamcli.vision import optical_flow, orb
+
+COUNTED = 16  # depth images whose readings are counted to judge their unit
 
 
 @dataclass(frozen=True)
@@ -29,6 +35,8 @@ class Frame:
     slope: np.ndarray  # (N, 2) float32 [1/m/px] of the inverse of depth
     coarse: np.ndarray | None  # (V, U) uint16, None where there is no depth
     faults: list[str]  # why an image could not be used
+    readings: Readings | None = None  # what its depth image holds
+    counts: np.ndarray | None = None  # (65536,) of a few frames: readings of each raw value
 
 
 def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
@@ -70,7 +78,18 @@ def assemble(found: list[Frame], inputs: Inputs, out: Path, cfg: Config, tools: 
         "with_depth": float(np.isfinite(features.depth).mean()) if len(features.depth) else 0.0,
         "frames_without_depth": int(np.isnan(features.depth_stamp).sum()),
         "bad_images": sum(len(frame.faults) for frame in found),
-    }
+    } | doubt.to_summary(_doubts(dataset, found, features))
+
+
+def _doubts(dataset: Dataset, found: list[Frame], features: Features) -> list[Finding]:
+    """Judge whether the images are what a camera sees."""
+    counts = [frame.counts for frame in found if frame.counts is not None]
+    coarse = [frame.coarse if frame.coarse is not None else np.zeros(0, np.uint16) for frame in found]
+    return [
+        *stream_doubt.about_readings([frame.readings for frame in found]),
+        *(stream_doubt.about_unit(np.sum(counts, axis=0), depth_unit.counting_scale(dataset.camera.depth_scale)) if counts else []),
+        *stream_doubt.about_motion(features.stamp, stream_doubt.same_pictures(features), stream_doubt.same_depth(coarse)),
+    ]
 
 
 def _extract(dataset: Dataset, settings: ExtractConfig, i: int) -> Frame:
@@ -92,7 +111,15 @@ def _extract(dataset: Dataset, settings: ExtractConfig, i: int) -> Frame:
     read = at_key_points.depth_at(depth, points.xy, window=settings.depth_window)
     if settings.depth_jump:
         read = np.where(at_key_points.is_behind_outline(depth, points.xy, jump=settings.depth_jump), np.float32(np.nan), read)
-    return Frame(points, read, at_key_points.inverse_depth_slope(depth, points.xy), icp.coarsen(depth), faults)
+    slope, readings = at_key_points.inverse_depth_slope(depth, points.xy), stream_doubt.look(depth)
+    return Frame(points, read, slope, icp.coarsen(depth), faults, readings, _counts(dataset, depth, i))
+
+
+def _counts(dataset: Dataset, depth: np.ndarray, i: int) -> np.ndarray | None:
+    """Count the readings of each raw value in frame i's depth image, if it is one of those looked at."""
+    if i not in spread(len(dataset), COUNTED):
+        return None
+    return depth_unit.counted_metres(depth, depth_unit.counting_scale(dataset.camera.depth_scale))
 
 
 def detect(grey: np.ndarray, settings: ExtractConfig) -> orb.KeyPoints:

@@ -11,7 +11,7 @@ from slamcli.calibration import rolling_shutter, self_calibration
 from slamcli.calibration.self_calibration import Sensing
 from slamcli.config.options import Config
 from slamcli.schema import Features, Map, Moving, Timing, Tracks
-from slamcli.slam import final_refinement, map_segments
+from slamcli.slam import calibration_doubt, doubt, final_refinement, map_segments
 from slamcli.slam.depth_tracking import NO_FRAME_POINTS, FramePoints
 from slamcli.sparse_map import map_adjustment
 from slamcli.sparse_map.sparse_map import SparseMap
@@ -33,6 +33,7 @@ def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
         sparse_map = SparseMap.from_map(features, map_)
         frame_points = FramePoints(depth, given, cfg.sensor)
         tracks, sensing, summary = refine(sparse_map, features, tracks, sensing, cfg, tools, frame_points=frame_points)
+        summary |= doubt.to_summary(calibration_doubt.judge(sparse_map, sensing, cfg.sensor))
         map_ = map_segments.anchored(sparse_map.snapshot(), tracks)
     save_map(out, features.stamp, tracks, map_)
     artifacts.save(sensing.timing, out)

@@ -1,0 +1,133 @@
+"""Does the map bear out the calibration? What the recording says of numbers that were given as certain.
+
+Two looks that do not depend on one another. A map at its optimum says by how much each number of the camera would have to change to
+make its residuals least, and how sure that is (`estimation/shared_parameters.py`); a sound one says zero for all of them. And points seen
+from two places keep their distances from one another: under a wrong focal length the same points, measured in depth and pixels in two
+parts of the image, are no rigid body. That needs no pose, so it also holds where a map is ruined.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from slamcli.calibration import self_calibration
+from slamcli.calibration.self_calibration import Sensing
+from slamcli.config.options import SensorConfig
+from slamcli.depth import noise_model
+from slamcli.geometry.camera import Camera
+from slamcli.sparse_map.sparse_map import SparseMap
+
+# Standard deviations of what is looked for: wide, as whatever the map says is to be heard. Shares of the focal length and of the picture's
+# width; k1 as it is; [1/m].
+PRIOR_FOCAL, PRIOR_CENTRE, PRIOR_LENS, PRIOR_SHIFT, PRIOR_DISPARITY = 0.3, 0.1, 0.3, 0.05, 0.05
+SHARED = 25  # landmarks with depth that two key frames share, to be compared
+NEXT = 5  # later key frames that each is compared with
+MOST_PAIRS = 60  # of key frames, evenly spread
+FACTORS = np.geomspace(0.35, 2.8, 37)  # on the focal length, tried on all pairs
+FARTHEST = 6.0  # [m] of the points compared: beyond, depth says little
+
+
+@dataclass(frozen=True)
+class Deviation:
+    """By how much the map would have a number changed."""
+
+    value: float
+    sigma: float
+
+    @property
+    def certainty(self) -> float:
+        """Return the value in standard deviations."""
+        return abs(self.value) / self.sigma
+
+
+@dataclass(frozen=True)
+class Rigidity:
+    """How rigid the points are that two key frames see, under other focal lengths."""
+
+    factor: float  # on the focal length, under which they are most rigid
+    gain: float  # times by which they are more rigid then than under the one given
+    pairs: int  # of key frames that were compared
+
+
+def deviations(sparse_map: SparseMap, now: Sensing, sensor: SensorConfig) -> dict[str, Deviation]:
+    """Find by how much an adjusted map would have the camera changed; nothing where it is not determined.
+
+    Returns "focal", a share of fx and fy alike; "cx", "cy", "shift_x", "shift_y" (of depth on colour), shares of the picture's width; "k1".
+    """
+    width = float(now.camera.width)
+    unit = {"focal": 1.0, "cx": width, "cy": width, "k1": 1.0, "shift_x": width, "shift_y": width}
+    share = {"focal": PRIOR_FOCAL, "cx": PRIOR_CENTRE, "cy": PRIOR_CENTRE, "k1": PRIOR_LENS, "shift_x": PRIOR_SHIFT, "shift_y": PRIOR_SHIFT}
+    # What an error of disparity bends is not to be taken for a lens.
+    prior = {name: share[name] * unit[name] for name in share} | {"inverse_depth_offset": PRIOR_DISPARITY}
+    found = self_calibration.deviations(sparse_map, now, sensor, prior=prior)
+    if found is None:
+        return {}
+    return {
+        name: Deviation(float(value) / unit[name], float(sigma) / unit[name])
+        for name, value, sigma in zip(prior, found.value, found.sigma, strict=True)
+        if name in unit
+    }
+
+
+def rigidity(sparse_map: SparseMap, camera: Camera, sensor: SensorConfig) -> Rigidity | None:
+    """Find the focal length under which points seen by two key frames are most rigid; None where no two see enough together."""
+    pairs = _pairs(sparse_map)
+    costs = [cost for i, j in pairs if (cost := _misfit(sparse_map, camera, sensor, i, j)) is not None]
+    if not costs:
+        return None
+    total = np.mean(costs, axis=0)
+    best = int(np.argmin(total))
+    given = float(np.interp(0.0, np.log(FACTORS), total))
+    return Rigidity(_summit(total, best), given / max(float(total[best]), 1e-9), len(costs))
+
+
+def _pairs(sparse_map: SparseMap) -> list[tuple[int, int]]:
+    """List pairs of key frames that share enough landmarks."""
+    found = []
+    for i in range(len(sparse_map.kf)):
+        shared = sparse_map.votes(sparse_map.landmarks_of(i))
+        found += [(i, int(j)) for j in i + 1 + np.flatnonzero(shared[i + 1 : i + 1 + NEXT] >= SHARED)]
+    chosen = np.unique(np.linspace(0, len(found) - 1, min(len(found), MOST_PAIRS)).astype(int)) if found else []
+    return [found[k] for k in chosen]
+
+
+def _misfit(sparse_map: SparseMap, camera: Camera, sensor: SensorConfig, i: int, j: int) -> np.ndarray | None:
+    """Return how far the points that two key frames share are from a rigid body, median in standard deviations, for each of FACTORS."""
+    first, second = (sparse_map.rows_of(kf) for kf in (i, j))
+    # A landmark is seen once by a key frame; features without one are told apart by their numbers.
+    of_first, of_second = (np.where(ids >= 0, ids, -k) for ids, k in ((sparse_map.lm_of_row[first], 1), (sparse_map.lm_of_row[second], 2)))
+    _, at_first, at_second = np.intersect1d(of_first, of_second, return_indices=True)
+    rows = [first.start + at_first, second.start + at_second]
+    features = sparse_map.features
+    depth = [np.asarray(features.depth[row], dtype=np.float64) for row in rows]
+    with np.errstate(invalid="ignore"):
+        is_near = (depth[0] < FARTHEST) & (depth[1] < FARTHEST)
+    if is_near.sum() < SHARED:
+        return None
+    xy = [np.asarray(features.xy[row], dtype=np.float64)[is_near] for row in rows]
+    x = [camera.backproject(p, z[is_near]) for p, z in zip(xy, depth, strict=True)]
+    sigma = np.hypot(*(noise_model.depth_sigma(p[:, 2], base=sensor.depth_noise_base, quadratic=sensor.depth_noise_quadratic) for p in x))
+    scaled = [p[None] / np.stack([FACTORS, FACTORS, np.ones_like(FACTORS)], axis=1)[:, None] for p in x]
+    return np.median(_residuals(scaled[0], scaled[1], sigma**-2.0) / sigma, axis=1)
+
+
+def _residuals(a: np.ndarray, b: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Return the distances (S, N) [m] that the rigid motion from points a (S, N, 3) to b leaves, of S sets each, weights (N,).
+
+    W. Kabsch, A solution for the best rotation to relate two sets of vectors, Acta Cryst. A32, 1976, doi:10.1107/S0567739476001873
+    """
+    share = weight / weight.sum()
+    a, b = (p - np.einsum("n,sni->si", share, p)[:, None] for p in (a, b))
+    U, _, Vt = np.linalg.svd(np.einsum("n,sni,snj->sij", share, a, b))
+    Vt[:, 2] *= np.sign(np.linalg.det(U @ Vt))[:, None]
+    return np.linalg.norm(b - np.einsum("sni,sij->snj", a, U @ Vt), axis=2)
+
+
+def _summit(total: np.ndarray, best: int) -> float:
+    """Return the factor between FACTORS where the cost is least, by the parabola through three of them."""
+    if not 0 < best < len(total) - 1:
+        return float(FACTORS[best])
+    before, here, after = total[best - 1 : best + 2]
+    bend = before - 2.0 * here + after
+    step = 0.5 * (before - after) / bend if bend > 0.0 else 0.0
+    return float(FACTORS[best] * (FACTORS[1] / FACTORS[0]) ** step)

@@ -1,0 +1,71 @@
+"""Signs that the calibration is not that of the recording, in words: focal length, principal point, lens, depth that lies off colour."""
+
+from slamcli.calibration import plausibility
+from slamcli.calibration.plausibility import Deviation, Rigidity
+from slamcli.calibration.self_calibration import Sensing
+from slamcli.config.options import SensorConfig
+from slamcli.geometry.camera import Camera
+from slamcli.slam.doubt import Finding
+from slamcli.sparse_map.sparse_map import SparseMap
+
+# From where on a deviation is a fault. Sound recordings reach 4 standard deviations, as these include errors that are none of the
+# calibration's, and 0.011, 0.006, 0.016, 0.003; what is wrong reaches 8 standard deviations and twice the values below.
+CERTAIN = 6.0
+LIMIT = {"focal": 0.02, "cx": 0.01, "cy": 0.01, "k1": 0.03, "shift_x": 0.006, "shift_y": 0.006}
+RIGID_GAIN, RIGID_FACTOR = 1.15, 1.05  # sound recordings reach 1.02 and, without any gain, 1.03
+RIGID_PAIRS = 4
+
+
+def judge(sparse_map: SparseMap, now: Sensing, sensor: SensorConfig) -> list[Finding]:
+    """Test whether an adjusted map bears out the camera that it was made with; returns the likeliest fault alone."""
+    rigid = plausibility.rigidity(sparse_map, now.camera, sensor)
+    return about(plausibility.deviations(sparse_map, now, sensor), rigid, now.camera)
+
+
+def about(found: dict[str, Deviation], rigid: Rigidity | None, camera: Camera) -> list[Finding]:
+    """Name the likeliest fault: faults look a little like one another, and the greatest is the one that is there."""
+    if rigid is not None and rigid.pairs >= RIGID_PAIRS and rigid.gain >= RIGID_GAIN and not 1 / RIGID_FACTOR < rigid.factor < RIGID_FACTOR:
+        return [_focal_length(rigid.factor, camera)]
+    excess = {name: abs(found[name].value) / limit for name, limit in LIMIT.items() if name in found and found[name].certainty >= CERTAIN}
+    worst = max(excess, key=excess.__getitem__, default="")
+    if not worst or excess[worst] < 1.0:
+        return []
+    if worst == "focal":
+        return [_focal_length(1.0 + found["focal"].value, camera)]
+    if worst == "k1":
+        return [_lens(found["k1"].value, camera)]
+    return [_depth_shift(found, camera) if worst.startswith("shift") else _principal_point(found, camera)]
+
+
+def _focal_length(factor: float, camera: Camera) -> Finding:
+    text = (
+        f"the focal length does not fit what the recording shows: about fx = {camera.fx * factor:.0f} px would, not {camera.fx:.0f}; "
+        "the calibration is of another camera or picture size, or pictures were scaled or cut: give the right fx and fy"
+    )
+    return Finding("focal_length", text, is_grave=True)
+
+
+def _principal_point(found: dict[str, Deviation], camera: Camera) -> Finding:
+    x, y = (camera.width * found[name].value for name in ("cx", "cy"))
+    text = (
+        f"the principal point does not fit what the recording shows: about ({camera.cx + x:.0f}, {camera.cy + y:.0f}) px would, not "
+        f"({camera.cx:.0f}, {camera.cy:.0f}); pictures were cut, cx and cy are of other pictures, or depth lies off colour: give the right cx and cy"
+    )
+    return Finding("principal_point", text, is_grave=True)
+
+
+def _lens(change: float, camera: Camera) -> Finding:
+    text = (
+        f"the lens distortion does not fit what the recording shows: about k1 = {camera.k1 + change:.2f} would, not {camera.k1:.2f}; "
+        "the coefficients are of another camera, or the pictures have been undistorted already (then all are 0)"
+    )
+    return Finding("lens", text, is_grave=True)
+
+
+def _depth_shift(found: dict[str, Deviation], camera: Camera) -> Finding:
+    x, y = (camera.width * found[name].value for name in ("shift_x", "shift_y"))
+    text = (
+        f"depth does not lie on colour: it seems to be off by ({x:+.0f}, {y:+.0f}) px or more; "
+        "it was not registered to colour, or with another calibration, and the map's scale is in doubt"
+    )
+    return Finding("depth_shift", text, is_grave=True)
