@@ -33,6 +33,7 @@ class Deviation:
 
     value: float
     sigma: float
+    explained: float  # share of the chi2 of all residuals that goes with it
 
     @property
     def certainty(self) -> float:
@@ -59,12 +60,13 @@ def deviations(sparse_map: SparseMap, now: Sensing, sensor: SensorConfig) -> dic
     share = {"focal": PRIOR_FOCAL, "cx": PRIOR_CENTRE, "cy": PRIOR_CENTRE, "k1": PRIOR_LENS, "shift_x": PRIOR_SHIFT, "shift_y": PRIOR_SHIFT}
     # What an error of disparity bends is not to be taken for a lens.
     prior = {name: share[name] * unit[name] for name in share} | {"inverse_depth_offset": PRIOR_DISPARITY}
-    found = self_calibration.deviations(sparse_map, now, sensor, prior=prior)
-    if found is None:
+    asked = self_calibration.deviations(sparse_map, now, sensor, prior=prior)
+    if asked is None:
         return {}
+    shares = zip(prior, asked.found.value, asked.found.sigma, strict=True)
     return {
-        name: Deviation(float(value) / unit[name], float(sigma) / unit[name])
-        for name, value, sigma in zip(prior, found.value, found.sigma, strict=True)
+        name: Deviation(float(value) / unit[name], float(sigma) / unit[name], float((value / sigma) ** 2 / max(asked.chi2, 1e-9)))
+        for name, value, sigma in shares
         if name in unit
     }
 

@@ -11,6 +11,7 @@ import numpy as np
 from slamcli.calibration import rolling_shutter
 from slamcli.config.options import OptimizeConfig, SensorConfig
 from slamcli.estimation import bundle_adjustment, shared_parameters
+from slamcli.estimation.camera_pose import CHI2_95_2DOF, CHI2_95_3DOF
 from slamcli.estimation.shared_parameters import Shared
 from slamcli.geometry.camera import Camera
 from slamcli.schema import Features, Timing
@@ -21,6 +22,7 @@ TIMES = "readout", "depth_readout", "depth_delay"  # fields of Timing that are l
 # Only looked at, never corrected: the share of both focal lengths, and [px] by which depth lies off colour.
 FOCAL, SHIFTS = "focal", ("shift_x", "shift_y")
 SIGNIFICANT = 3.0  # standard deviations
+MOST_KEY_FRAMES = 80  # whose landmarks are asked what they would have changed
 ROWS_AT_ONCE = 1 << 18  # features recalibrated together: the intermediate results of a long recording would fill the memory
 STEP = 1e-3  # of its prior sigma, by which an unknown of the calibration is moved to see what that does
 
@@ -76,7 +78,8 @@ def estimate_sensing(
     given : the recording's calibration; prior : as `unknowns` gives it, standard deviations of the timing around 0, of the rest around `given`
     Returns better numbers, with the same motion, those as before that do not differ significantly; None where the map is not determined.
     """
-    asked = _ask(sparse_map, now, sensor, prior)
+    part = map_adjustment.gather(sparse_map, np.arange(len(sparse_map.kf), dtype=np.int32), sensor)
+    asked = _ask(sparse_map, part, now, prior)
     if asked is None:
         return None
     problem, columns, pivot = asked
@@ -97,23 +100,38 @@ def estimate_sensing(
     return Sensing(replace(now.camera, **better), replace(now.timing, **when), dict(zip(names, found.sigma.tolist(), strict=True)))
 
 
-def deviations(sparse_map: SparseMap, now: Sensing, sensor: SensorConfig, *, prior: dict[str, float]) -> Shared | None:
-    """Find by how much an adjusted map would have numbers changed, in the order of `prior`; None where the map is not determined.
+@dataclass(frozen=True)
+class Deviations:
+    """By how much a map would have numbers changed."""
+
+    found: Shared  # in the order of the prior
+    chi2: float  # of the observations that were used
+
+
+def deviations(sparse_map: SparseMap, now: Sensing, sensor: SensorConfig, *, prior: dict[str, float]) -> Deviations | None:
+    """Find by how much an adjusted map would have numbers changed; None where the map is not determined.
 
     prior : standard deviations around what is known now: of fields of Timing or Camera, of FOCAL and of SHIFTS
+    Only landmarks count, and in a long recording those of a stretch of MOST_KEY_FRAMES: edges were measured with the numbers in question.
     """
-    asked = _ask(sparse_map, now, sensor, prior)
+    n = len(sparse_map.kf)
+    first = max(0, (n - MOST_KEY_FRAMES) // 2)
+    part = map_adjustment.gather(sparse_map, np.arange(n, dtype=np.int32), sensor)
+    asked = _ask(sparse_map, map_adjustment.landmarks_alone(part, first, first + MOST_KEY_FRAMES), now, prior)
     if asked is None:
         return None
     problem, columns, _ = asked
-    return shared_parameters.estimate(problem, columns, prior=np.zeros(len(prior)), prior_sigma=np.array(list(prior.values())))
+    found = shared_parameters.estimate(problem, columns, prior=np.zeros(len(prior)), prior_sigma=np.array(list(prior.values())))
+    if found is None:
+        return None
+    chi2 = problem.chi2(problem.T, problem.x)
+    return Deviations(found, float(chi2[chi2 <= problem.threshold(np.array([CHI2_95_2DOF, CHI2_95_3DOF]))].sum()))
 
 
 def _ask(
-    sparse_map: SparseMap, now: Sensing, sensor: SensorConfig, prior: dict[str, float]
+    sparse_map: SparseMap, part: map_adjustment.Part, now: Sensing, prior: dict[str, float]
 ) -> tuple[bundle_adjustment.Problem, np.ndarray, float] | None:
     """Make the problem whose optimum the map is, what each unknown does to its measurements (O, 3, G), and the depth that offsets turn about."""
-    part = map_adjustment.gather(sparse_map, np.arange(len(sparse_map.kf), dtype=np.int32), sensor)
     if len(part.row) == 0 or not prior:
         return None
     T_kw, x_w = sparse_map.T_kw(part.kfs), sparse_map.lm.xyz[part.ids]

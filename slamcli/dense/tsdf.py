@@ -75,10 +75,11 @@ class Volume:
 
     def mesh(self) -> Mesh:
         """Extract the surface: W. Lorensen and H. Cline, Marching cubes, SIGGRAPH 1987, doi:10.1145/37401.37422."""
+        nothing = Mesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32))
+        if self._grid.hashmap().size() == 0:  # Open3D's own error would not say why
+            return nothing
         found = self._grid.extract_triangle_mesh(weight_threshold=MIN_WEIGHT)
-        if "positions" not in found.vertex or len(found.vertex["positions"]) == 0:
-            return Mesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32))
-        return _in_order(found)
+        return _in_order(found) if "positions" in found.vertex and len(found.vertex["positions"]) else nothing
 
 
 def _in_order(found: Any) -> Mesh:

@@ -127,13 +127,12 @@ def _about_registration(dataset: Dataset, times: Timing, *, is_textured: bool, w
 
 
 def doubts(findings: list[Finding]) -> list[doubt.Finding]:
-    """Pick the findings on a recording that put what is made of it in doubt as a whole, as a run keeps them."""
-    names = {"registration": "registration", "time offset": "depth_delay"}
-    return [
-        doubt.Finding(names[one.check], f"{one.message}: {one.advice}", is_grave=True)
-        for one in findings
-        if one.check in names and one.level != NOTE
-    ]
+    """Pick the finding on a recording that puts what is made of it in doubt as a whole, as a run keeps it: depth off colour, else late."""
+    for check, name in (("registration", "registration"), ("time offset", "depth_delay")):
+        found = [one for one in findings if one.check == check and one.level != NOTE]
+        if found:
+            return [doubt.Finding(name, f"{one.message}: {one.advice}", is_grave=True) for one in found]
+    return []
 
 
 def _facts(dataset: Dataset, times: Timing, seen: Pictures, unit: DepthUnit, fit: Registration) -> dict[str, Any]:

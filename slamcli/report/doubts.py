@@ -9,6 +9,7 @@ from slamcli.evaluation.run_content import Content
 from slamcli.runs.staleness import MISSING
 from slamcli.schema import ON_DEPTH, RELOCALIZED, TRACKED
 from slamcli.slam import doubt
+from slamcli.slam.doubt import Finding
 
 GOOD, NOTE, BAD = "good", "note", "bad"
 FEW_FEATURES = 150  # in a frame
@@ -48,8 +49,11 @@ def remarks(content: Content, inspected: Sequence[tuple[str, str]] = ()) -> list
 
 
 def _findings(content: Content) -> list[Remark]:
-    records = {stage: state.record for stage, state in content.states.items()}
-    return [Remark(BAD if one.is_grave else NOTE, f"{one.text[:1].upper()}{one.text[1:]}.") for one in doubt.from_records(records)]
+    return [Remark(BAD if one.is_grave else NOTE, f"{one.text[:1].upper()}{one.text[1:]}.") for one in _doubts(content)]
+
+
+def _doubts(content: Content) -> list[Finding]:
+    return doubt.from_records({stage: state.record for stage, state in content.states.items()})
 
 
 def _map(content: Content) -> list[Remark]:
@@ -151,7 +155,12 @@ def _stages(content: Content) -> list[Remark]:
 
 
 def headline(content: Content) -> str:
-    """Sum up in one line."""
+    """Sum up in one line, and before that what puts the whole in doubt."""
+    said = doubt.verdict(_doubts(content))
+    return f"{said}. {_located(content)}" if said else _located(content)
+
+
+def _located(content: Content) -> str:
     n, n_poses = len(content.stamp), int(content.has_pose.sum())
     path = content.T_lc[content.has_pose, :3, 3]
     length = float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())

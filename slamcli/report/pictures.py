@@ -59,6 +59,8 @@ def draw(run: RunDir, content: Content) -> list[Picture]:
 def _cloud(run: RunDir, title: str, path: np.ndarray) -> Picture:
     file = run.stage_path("densify", "cloud.ply")
     xyz, rgb, normal = cloud.read_ply(file)
+    if not len(xyz):
+        raise SlamError("the cloud is empty")
     step = -(-len(xyz) // MOST_POINTS)
     rgb = rgb if rgb is not None else np.full((len(xyz), 3), 128, np.uint8)
     spacing = float(run.config().densify.voxel) * step**0.5
@@ -70,8 +72,8 @@ def _octree(run: RunDir, title: str, path: np.ndarray) -> Picture:
     file, small = run.stage_path("octree", "map.ot"), run.stage_path("octree", "map.bt")
     tree = octomap.read(file)
     sizes = f"map.ot {file.stat().st_size / 1e6:.2f} MB, map.bt {small.stat().st_size / 1e6:.3f} MB"
-    low, high = render.octree_heights(tree)
     image = render.draw_octree(tree, view=VIEW, path=path, with_scale=True)
+    low, high = render.octree_heights(tree)
     return Picture(
         title,
         f"occupied cells of {float(tree.resolution):g} m, coloured by height, from {round(low, 1) + 0.0:.1f} m (blue) to {high:.1f} m (red); {sizes}",

@@ -12,9 +12,13 @@ import numpy as np
 
 DOUBTS = "doubts"  # key in a stage's summary
 MANY = 0.2  # share of doubtful frames from which on a run is doubtful as a whole
-# Images that are not what they should be look like a wrong calibration to the map: where the first is found, the second is no news.
-OF_IMAGES = frozenset({"frozen", "frozen_colour", "frozen_depth", "depth_readings", "depth_delay", "registration"})
-OF_CALIBRATION = frozenset({"focal_length", "principal_point", "lens", "depth_shift", "map"})
+# What explains what: streams that hold no measurements look as if depth lay off colour, and either looks like a wrong calibration to the
+# map. Where a grave finding of one line is there, those of the lines below are no news.
+CAUSES = (
+    frozenset({"frozen", "frozen_colour", "frozen_depth", "depth_readings"}),
+    frozenset({"registration", "depth_delay"}),
+    frozenset({"focal_length", "principal_point", "lens", "depth_shift"}),
+)
 
 
 @dataclass(frozen=True)
@@ -42,9 +46,9 @@ def from_records(records: Mapping[str, Mapping[str, Any] | None]) -> list[Findin
     """Collect the findings of all stages' records, the grave ones first; those that others explain are left out."""
     rows = [row for record in records.values() if record is not None for row in record.get("summary", {}).get(DOUBTS, [])]
     findings = dict.fromkeys(Finding(str(row["name"]), str(row["text"]), bool(row["is_grave"])) for row in rows)
-    is_explained = any(finding.is_grave and finding.name in OF_IMAGES for finding in findings)
-    told = [finding for finding in findings if not (is_explained and finding.name in OF_CALIBRATION)]
-    return sorted(told, key=lambda finding: not finding.is_grave)
+    first = next((k for k, names in enumerate(CAUSES) if any(one.is_grave and one.name in names for one in findings)), len(CAUSES))
+    explained = frozenset[str]().union(*CAUSES[first + 1 :])
+    return sorted((finding for finding in findings if finding.name not in explained), key=lambda finding: not finding.is_grave)
 
 
 def verdict(findings: Iterable[Finding]) -> str:

@@ -82,7 +82,9 @@ def unit_finding(unit: DepthUnit, scale: float) -> list[Finding]:
     likely = unit.likely_scale
     if likely is None:
         return []
-    how = f"the map is {likely / scale:.2g} times as large as the room" if likely > scale else f"the map has {likely / scale:.2g} of its size"
+    how = (
+        f"the map is {likely / scale:.2g} times as large as the room" if likely > scale else f"the map has {likely / scale:.2g} of its size"
+    )
     text = f"the depth scale {scale:g} is doubtful, as {unit.reason}: if so, {how}, and camera.depth_scale = {likely:g} is right"
     return [Finding("depth_scale", text, is_grave=True)]
 
@@ -119,7 +121,12 @@ def about_motion(stamp: np.ndarray, colour: np.ndarray, depth: np.ndarray) -> li
     colour, depth = _long(stamp, colour), _long(stamp, depth)
     both = colour & depth
     cases = (
-        ("frozen", both, "colour and depth", "the recorder hung, or a camera without noise stood still; what is missing there no map shows"),
+        (
+            "frozen",
+            both,
+            "colour and depth",
+            "the recorder hung, or a camera without noise stood still; what is missing there no map shows",
+        ),
         ("frozen_colour", colour & ~both, "colour", "the colour stream stood still while depth went on, so poses are wrong there"),
         ("frozen_depth", depth & ~both, "depth", "the depth stream stood still while colour went on, so poses and maps are wrong there"),
     )

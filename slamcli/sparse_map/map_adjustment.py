@@ -9,7 +9,7 @@ from slamcli.config.options import SensorConfig
 from slamcli.depth import noise_model
 from slamcli.estimation import bundle_adjustment
 from slamcli.estimation.bundle_adjustment import Observations
-from slamcli.estimation.relative_pose_factors import Edges
+from slamcli.estimation.relative_pose_factors import NO_EDGES, Edges
 from slamcli.geometry import se3
 from slamcli.geometry.camera import Camera
 from slamcli.schema import Features
@@ -80,6 +80,20 @@ def gather(sparse_map: SparseMap, moving: np.ndarray, sensor: SensorConfig) -> P
     measured = measure(sparse_map.features, row, sensor)
     seen = Observations(kf_index, obs_lm, measured.xy, measured.depth, measured.sigma_px, measured.sigma_z)
     return Part(kfs, is_fixed, shared, ids[is_single], row, seen, edges)
+
+
+def landmarks_alone(part: Part, first: int, end: int) -> Part:
+    """Return the landmarks that key frames `first` to `end`, the last left out, see more than once, without edges between key frames."""
+    is_in = (part.kfs >= first) & (part.kfs < end)
+    index, old_lm = np.cumsum(is_in) - 1, np.asarray(part.seen.lm)
+    is_used = is_in[part.seen.kf]
+    is_used &= np.bincount(old_lm[is_used], minlength=len(part.ids))[old_lm] > 1
+    ids, lm = np.unique(old_lm[is_used], return_inverse=True)
+    columns = (column[is_used] for column in (part.seen.xy, part.seen.depth, part.seen.sigma_px, part.seen.sigma_z))
+    seen = Observations(index[part.seen.kf[is_used]].astype(np.int32), lm, *columns)
+    kfs, is_fixed = part.kfs[is_in], part.is_fixed[is_in].copy()
+    is_fixed[:1] = True
+    return Part(kfs, is_fixed, part.ids[ids], part.singles[:0], part.row[is_used], seen, NO_EDGES)
 
 
 def adjust(

@@ -70,7 +70,9 @@ def assemble(found: list[Frame], inputs: Inputs, out: Path, cfg: Config, tools: 
     artifacts.save(_flow_table(dataset, camera, found, tools) if cfg.extract.flow else Flow(), out)
     _write_association(out / "frames.txt", dataset, features.depth_stamp)
     write_camera(out, camera)
-    n = np.diff(features.offset)
+    doubts, n = _doubts(dataset, found, features), np.diff(features.offset)
+    for one in doubts:
+        tools.warn(one.text)
     return {
         "frames": len(dataset),
         "features": int(n.sum()),
@@ -78,7 +80,7 @@ def assemble(found: list[Frame], inputs: Inputs, out: Path, cfg: Config, tools: 
         "with_depth": float(np.isfinite(features.depth).mean()) if len(features.depth) else 0.0,
         "frames_without_depth": int(np.isnan(features.depth_stamp).sum()),
         "bad_images": sum(len(frame.faults) for frame in found),
-    } | doubt.to_summary(_doubts(dataset, found, features))
+    } | doubt.to_summary(doubts)
 
 
 def _doubts(dataset: Dataset, found: list[Frame], features: Features) -> list[Finding]:

@@ -33,7 +33,10 @@ def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
         sparse_map = SparseMap.from_map(features, map_)
         frame_points = FramePoints(depth, given, cfg.sensor)
         tracks, sensing, summary = refine(sparse_map, features, tracks, sensing, cfg, tools, frame_points=frame_points)
-        summary |= doubt.to_summary(calibration_doubt.judge(sparse_map, sensing, cfg.sensor))
+        doubts = calibration_doubt.judge(sparse_map, sensing, cfg.sensor)
+        for one in doubts:
+            tools.warn(one.text)
+        summary |= doubt.to_summary(doubts)
         map_ = map_segments.anchored(sparse_map.snapshot(), tracks)
     save_map(out, features.stamp, tracks, map_)
     artifacts.save(sensing.timing, out)
