@@ -6,6 +6,7 @@ from two places keep their distances from one another: under a wrong focal lengt
 parts of the image, are no rigid body. That needs no pose, so it also holds where a map is ruined.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,7 +24,8 @@ PRIOR_FOCAL, PRIOR_CENTRE, PRIOR_LENS, PRIOR_SHIFT, PRIOR_DISPARITY = 0.3, 0.1, 
 SHARED = 25  # landmarks with depth that two key frames share, to be compared
 NEXT = 5  # later key frames that each is compared with
 MOST_PAIRS = 60  # of key frames, evenly spread
-FACTORS = np.geomspace(0.35, 2.8, 37)  # on the focal length, tried on all pairs
+FACTORS = np.geomspace(1 / 2.8, 2.8, 37)  # on the focal length, tried on all pairs
+ROUNDS = 3  # in which false matches lose their weight
 FARTHEST = 6.0  # [m] of the points compared: beyond, depth says little
 
 
@@ -39,6 +41,14 @@ class Deviation:
     def certainty(self) -> float:
         """Return the value in standard deviations."""
         return abs(self.value) / self.sigma
+
+
+@dataclass(frozen=True)
+class Seen:
+    """Points as one view sees them, row by row those of another view."""
+
+    xy: np.ndarray  # (N, 2) px, undistorted
+    depth: np.ndarray  # (N,) m, NaN = none
 
 
 @dataclass(frozen=True)
@@ -73,8 +83,15 @@ def deviations(sparse_map: SparseMap, now: Sensing, sensor: SensorConfig) -> dic
 
 def rigidity(sparse_map: SparseMap, camera: Camera, sensor: SensorConfig) -> Rigidity | None:
     """Find the focal length under which points seen by two key frames are most rigid; None where no two see enough together."""
-    pairs = _pairs(sparse_map)
-    costs = [cost for i, j in pairs if (cost := _misfit(sparse_map, camera, sensor, i, j)) is not None]
+    return most_rigid((_shared(sparse_map, i, j) for i, j in _pairs(sparse_map)), camera, sensor)
+
+
+def most_rigid(views: Iterable[tuple[Seen, Seen]], camera: Camera, sensor: SensorConfig) -> Rigidity | None:
+    """Find the focal length under which points are most rigid, of which each pair of views shows some, row by row.
+
+    None where no pair shows enough points with depth. Some rows may be false matches.
+    """
+    costs = [cost for pair in views if (cost := _misfit(*pair, camera, sensor)) is not None]
     if not costs:
         return None
     total = np.mean(costs, axis=0)
@@ -93,34 +110,40 @@ def _pairs(sparse_map: SparseMap) -> list[tuple[int, int]]:
     return [found[k] for k in chosen]
 
 
-def _misfit(sparse_map: SparseMap, camera: Camera, sensor: SensorConfig, i: int, j: int) -> np.ndarray | None:
-    """Return how far the points that two key frames share are from a rigid body, median in standard deviations, for each of FACTORS."""
+def _shared(sparse_map: SparseMap, i: int, j: int) -> tuple[Seen, Seen]:
+    """Return how two key frames see the landmarks that they share."""
     first, second = (sparse_map.rows_of(kf) for kf in (i, j))
     # A landmark is seen once by a key frame; features without one are told apart by their numbers.
     of_first, of_second = (np.where(ids >= 0, ids, -k) for ids, k in ((sparse_map.lm_of_row[first], 1), (sparse_map.lm_of_row[second], 2)))
     _, at_first, at_second = np.intersect1d(of_first, of_second, return_indices=True)
-    rows = [first.start + at_first, second.start + at_second]
-    features = sparse_map.features
-    depth = [np.asarray(features.depth[row], dtype=np.float64) for row in rows]
+    features, rows = sparse_map.features, (first.start + at_first, second.start + at_second)
+    a, b = (Seen(np.asarray(features.xy[row], dtype=np.float64), np.asarray(features.depth[row], dtype=np.float64)) for row in rows)
+    return a, b
+
+
+def _misfit(a: Seen, b: Seen, camera: Camera, sensor: SensorConfig) -> np.ndarray | None:
+    """Return how far points seen twice are from a rigid body, median in standard deviations, for each of FACTORS; None of too few."""
     with np.errstate(invalid="ignore"):
-        is_near = (depth[0] < FARTHEST) & (depth[1] < FARTHEST)
+        is_near = (a.depth < FARTHEST) & (b.depth < FARTHEST)
     if is_near.sum() < SHARED:
         return None
-    xy = [np.asarray(features.xy[row], dtype=np.float64)[is_near] for row in rows]
-    x = [camera.backproject(p, z[is_near]) for p, z in zip(xy, depth, strict=True)]
+    x = [camera.backproject(seen.xy[is_near], seen.depth[is_near]) for seen in (a, b)]
     sigma = np.hypot(*(noise_model.depth_sigma(p[:, 2], base=sensor.depth_noise_base, quadratic=sensor.depth_noise_quadratic) for p in x))
-    scaled = [p[None] / np.stack([FACTORS, FACTORS, np.ones_like(FACTORS)], axis=1)[:, None] for p in x]
-    return np.median(_residuals(scaled[0], scaled[1], sigma**-2.0) / sigma, axis=1)
+    stretch = np.stack([FACTORS, FACTORS, np.ones_like(FACTORS)], axis=1)[:, None]
+    misfit = np.zeros((len(FACTORS), int(is_near.sum())))
+    for _ in range(ROUNDS):  # false matches lose their weight
+        misfit = _residuals(x[0] / stretch, x[1] / stretch, 1.0 / (1.0 + misfit**2) / sigma**2) / sigma
+    return np.median(misfit, axis=1)
 
 
 def _residuals(a: np.ndarray, b: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Return the distances (S, N) [m] that the rigid motion from points a (S, N, 3) to b leaves, of S sets each, weights (N,).
+    """Return the distances (S, N) [m] that the rigid motion from points a (S, N, 3) to b leaves, of S sets each, weights (S, N).
 
     W. Kabsch, A solution for the best rotation to relate two sets of vectors, Acta Cryst. A32, 1976, doi:10.1107/S0567739476001873
     """
-    share = weight / weight.sum()
-    a, b = (p - np.einsum("n,sni->si", share, p)[:, None] for p in (a, b))
-    U, _, Vt = np.linalg.svd(np.einsum("n,sni,snj->sij", share, a, b))
+    share = weight / weight.sum(axis=1, keepdims=True)
+    a, b = (p - np.einsum("sn,sni->si", share, p)[:, None] for p in (a, b))
+    U, _, Vt = np.linalg.svd(np.einsum("sn,sni,snj->sij", share, a, b))
     Vt[:, 2] *= np.sign(np.linalg.det(U @ Vt))[:, None]
     return np.linalg.norm(b - np.einsum("sni,sij->snj", a, U @ Vt), axis=2)
 

@@ -90,7 +90,7 @@ def judge(counts: np.ndarray, scale: float) -> DepthUnit:
         name = _camera_of(q)
         if name:
             return DepthUnit(percentiles, q, name, None, f"the steps between readings are those of a {name}")
-        likely = _likely_scale(constant or 0.0, scale)
+        likely = _likely_scale(constant or 0.0, scale, typical=percentiles["p50"])
         if likely is not None:
             name = _camera_of((constant or 0.0) / likely)
             reason = f"the steps between readings fit a {name} only if distances are {scale / likely:.2g} times as large"
@@ -145,11 +145,15 @@ def _round_scale(scale: float) -> float:
     return float(round(scale / unit / step) * step * unit)
 
 
-def _likely_scale(constant: float, scale: float) -> float | None:
-    """Find the scale under which readings are a known camera's, if the present one is off by a usual factor."""
+def _likely_scale(constant: float, scale: float, *, typical: float) -> float | None:
+    """Find the scale under which readings are a known camera's in a room, if the present one is off by a usual factor.
+
+    typical : [m] median depth under the present scale
+    """
     for other in COMMON_SCALES:
         ratio = max(other / scale, scale / other)
-        if any(abs(ratio / factor - 1.0) < 0.06 for factor in FACTORS) and _camera_of(constant / other):
+        is_usual = any(abs(ratio / factor - 1.0) < 0.06 for factor in FACTORS)
+        if is_usual and _camera_of(constant / other) and TYPICAL[0] <= typical * scale / other <= TYPICAL[1]:
             return other
     return None
 

@@ -14,7 +14,7 @@ from slamcli.datasets import Dataset, depth_unit, open_dataset, silent
 from slamcli.datasets.depth_unit import DepthUnit
 from slamcli.datasets.recording import spread
 from slamcli.errors import SlamError
-from slamcli.inspection import pictures, registration, timing
+from slamcli.inspection import pictures, registration, rigidity, timing
 from slamcli.inspection.findings import (
     ERROR,
     NOTE,
@@ -23,6 +23,7 @@ from slamcli.inspection.findings import (
     about_colour,
     about_depth,
     about_files,
+    about_focal_length,
     about_lists,
     about_order,
     about_registration,
@@ -88,7 +89,7 @@ def inspect(
     times = timing.judge(dataset)
     seen = pictures.look(dataset, workers=workers, progress=progress)
     unit = depth_unit.judge(seen.depth_counts, depth_unit.counting_scale(dataset.camera.depth_scale))
-    fit = registration.measure(dataset, workers=workers)
+    fit, rigid = registration.measure(dataset, workers=workers), rigidity.measure(dataset)
     findings = [
         *about_lists(dataset, times),
         *about_order(dataset, times, seen),
@@ -97,6 +98,7 @@ def inspect(
         *about_depth(dataset, times, seen),
         *about_streams(dataset, seen),
         *about_unit(dataset, unit),
+        *about_focal_length(dataset, rigid),
         *about_registration(dataset, fit, times, is_textured=is_textured(seen)),
     ]
     return Inspection(str(dataset.root), findings, _facts(dataset, times, seen, unit, fit))

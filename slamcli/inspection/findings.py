@@ -4,13 +4,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from slamcli.calibration.plausibility import Rigidity
 from slamcli.datasets import Dataset
 from slamcli.datasets.depth_unit import DepthUnit
 from slamcli.inspection import pictures, timing
 from slamcli.inspection.pictures import Pictures
 from slamcli.inspection.registration import Registration
 from slamcli.inspection.timing import Timing
-from slamcli.slam import stream_doubt
+from slamcli.slam import calibration_doubt, stream_doubt
 
 ERROR, WARNING, NOTE = "error", "warning", "note"
 
@@ -184,6 +185,11 @@ def about_unit(dataset: Dataset, unit: DepthUnit) -> list[Finding]:
     message = f"the depth scale {dataset.camera.depth_scale:g} is doubtful: {unit.reason}"
     level = WARNING if unit.q is not None and not unit.camera else ERROR  # a camera may be new
     return [Finding(level, "depth scale", message, f"try: -s camera.depth_scale={unit.likely_scale:g}")]
+
+
+def about_focal_length(dataset: Dataset, rigid: Rigidity | None) -> list[Finding]:
+    """Judge the focal length."""
+    return [Finding(ERROR, "focal length", *one.text.split(": ", 1)) for one in calibration_doubt.about({}, rigid, dataset.camera)]
 
 
 def about_registration(dataset: Dataset, fit: Registration, times: Timing, *, is_textured: bool) -> list[Finding]:

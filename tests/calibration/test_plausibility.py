@@ -1,0 +1,87 @@
+"""A map says which number of its camera is wrong, and nothing where all are right."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scene_run import Run
+from scenes import CAMERA, Scene, observe, orbit, room_points
+
+from slamcli.calibration import plausibility
+from slamcli.calibration.plausibility import Deviation, Rigidity, Seen
+from slamcli.config.options import SensorConfig
+from slamcli.geometry import se3
+from slamcli.slam import calibration_doubt
+from slamcli.stages import optimize, track
+
+WRONG = {  # what the calibration says, the finding, and the words with the right number
+    "right": ({}, "", ""),
+    "half": ({"fx": 260.0, "fy": 260.0}, "focal_length", "fx = 5"),
+    "double": ({"fx": 1040.0, "fy": 1040.0}, "focal_length", "fx = 5"),
+    "longer": ({"fx": 590.0, "fy": 590.0}, "focal_length", "fx = 5"),
+    "aside": ({"cx": 360.0}, "principal_point", "(33"),
+    "bent": ({"k1": 0.4}, "lens", "k1 = "),
+}
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    rng = np.random.default_rng(3)
+    nods = np.sin(np.outer(np.arange(40) / 6.0, [0, 0, 0, 1.0, 0.6, 0.8]) + np.arange(6)) * [0, 0, 0, 0.12, 0.06, 0.1]
+    return observe(orbit(40, turns=0.15) @ se3.exp(nods), room_points(3000, rng), rng)
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_the_wrong_number_is_named(scene: Scene, case: str, tmp_path: Path) -> None:
+    change, name, words = WRONG[case]
+    given = replace(CAMERA, **change)
+    features = scene.features
+    if "k1" in change:  # extract takes the distortion out that the calibration says
+        features = replace(features, xy=given.undistort(features.xy.astype(np.float64)).astype(np.float32))
+    run = Run(replace(scene, features=features), tmp_path, given=given)
+    for stage in (track, optimize):
+        run.stage(stage)
+    found = run.summary["optimize"].get("doubts", [])
+    assert [one["name"] for one in found] == ([name] if name else [])
+    assert all(one["is_grave"] and words in one["text"] for one in found)
+    assert [one["text"] for one in found] == [text for text in run.warnings if "does not fit" in text]
+
+
+@pytest.mark.parametrize("factor", [0.5, 0.9, 1.0, 1.3, 2.0])
+def test_points_seen_twice_are_rigid_under_the_right_focal_length_alone(factor: float) -> None:
+    """Found whatever the camera is believed to be, with a fifth of the matches false."""
+    rng = np.random.default_rng(5)
+    views = []
+    for k in range(6):
+        points = rng.uniform([-1.5, -1.2, 1.0], [1.5, 1.2, 4.0], (150, 3))
+        T = se3.exp(rng.normal(0.0, [0.2, 0.2, 0.2, 0.15, 0.15, 0.15]))
+        both = []
+        for x in (points, se3.transform(T, points)):
+            depth = x[:, 2] + rng.normal(0.0, 0.01, len(x))
+            both.append(Seen(CAMERA.project(x) + rng.normal(0.0, 0.5, (len(x), 2)), depth))
+        order = np.concatenate([rng.permutation(30), np.arange(30, 150)])
+        views.append((both[0], Seen(both[1].xy[order], both[1].depth[order])))
+    believed = replace(CAMERA, fx=CAMERA.fx / factor, fy=CAMERA.fy / factor)
+    found = plausibility.most_rigid(views, believed, SensorConfig())
+    assert found is not None and found.pairs == 6
+    assert found.factor == pytest.approx(factor, rel=0.04)
+    assert 0.99 < found.gain < 1.02 if factor == 1.0 else found.gain > 1.02
+
+
+def test_too_few_points_say_nothing() -> None:
+    few = Seen(np.zeros((5, 2)), np.ones(5))
+    assert plausibility.most_rigid([(few, few)], CAMERA, SensorConfig()) is None
+    assert plausibility.most_rigid([], CAMERA, SensorConfig()) is None
+
+
+def test_the_greatest_fault_is_named_alone_and_small_or_unsure_ones_never() -> None:
+    sure, strong = {"sigma": 0.001, "explained": 0.3}, {"sigma": 0.001, "explained": 0.5}
+    found = {"focal": Deviation(0.05, **sure), "cx": Deviation(-0.05, **strong), "cy": Deviation(0.0, **sure), "k1": Deviation(0.2, 0.1, 0.5)}
+    assert [one.name for one in calibration_doubt.about(found, None, CAMERA)] == ["principal_point"]
+    assert calibration_doubt.about({"focal": Deviation(0.05, 0.001, 0.03)}, None, CAMERA) == []
+    assert calibration_doubt.about({"focal": Deviation(0.01, **sure)}, None, CAMERA) == []
+    assert calibration_doubt.about({}, Rigidity(0.7, 1.1, 20), CAMERA) == []
+    assert [one.name for one in calibration_doubt.about(found, Rigidity(0.5, 2.0, 20), CAMERA)] == ["focal_length"]
+    assert [one.name for one in calibration_doubt.about(dict.fromkeys(("shift_x", "shift_y"), Deviation(0.02, **sure)), None, CAMERA)] == ["depth_shift"]
+
