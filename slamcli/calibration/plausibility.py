@@ -102,12 +102,11 @@ def most_rigid(views: Iterable[tuple[Seen, Seen]], camera: Camera, sensor: Senso
 
 def _pairs(sparse_map: SparseMap) -> list[tuple[int, int]]:
     """List pairs of key frames that share enough landmarks."""
-    found = []
+    found: list[tuple[int, int]] = []
     for i in range(len(sparse_map.kf)):
         shared = sparse_map.votes(sparse_map.landmarks_of(i))
         found += [(i, int(j)) for j in i + 1 + np.flatnonzero(shared[i + 1 : i + 1 + NEXT] >= SHARED)]
-    chosen = np.unique(np.linspace(0, len(found) - 1, min(len(found), MOST_PAIRS)).astype(int)) if found else []
-    return [found[k] for k in chosen]
+    return [found[k] for k in sorted({int(k) for k in np.linspace(0, len(found) - 1, min(len(found), MOST_PAIRS))})] if found else []
 
 
 def _shared(sparse_map: SparseMap, i: int, j: int) -> tuple[Seen, Seen]:

@@ -163,8 +163,8 @@ def _column(name: str, features: Features, rows: np.ndarray, predicted: np.ndarr
     pivot : [m] depth of readings that the offset of inverse depth leaves as they are
     """
     if name == FOCAL:
-        focal = (("fx", now.camera.fx), ("fy", now.camera.fy))
-        return sum((value * _column(one, features, rows, predicted, now, sigma * value, pivot) for one, value in focal), np.zeros(1))
+        both = (("fx", now.camera.fx), ("fy", now.camera.fy))
+        return sum((value * _column(one, features, rows, predicted, now, sigma * value, pivot) for one, value in both), np.zeros(1))
     column = np.zeros((len(rows), 3))
     if name in TIMES:
         moving = rolling_shutter.flow(features, now.timing.twist, now.camera, rows)

@@ -168,7 +168,7 @@ def about_streams(dataset: Dataset, seen: Pictures) -> list[Finding]:
     same = (np.append(False, (taken[1:] == taken[:-1]) & (taken[1:] >= 0)) for taken in (seen.picture_sum, seen.depth_sum))
     found = stream_doubt.about_motion(dataset.stamp, *same)
     if any(one is not None and one.share > 0 for one in seen.readings):  # else `about_depth` says so
-        found += stream_doubt.about_readings(seen.readings)
+        found += stream_doubt.about_readings(list(seen.readings))
     return [Finding(ERROR if one.is_grave else WARNING, one.name.replace("_", " "), *one.text.split(": ", 1)) for one in found]
 
 

@@ -84,7 +84,7 @@ def _frame(dataset: Dataset, i: int) -> tuple[dict[str, Any], np.ndarray | None,
     row["depth_thumbnail"] = _inverse_depth_thumbnail(depth, seen)
     row["readings"] = readings = stream_doubt.look(depth)
     if readings.spread > stream_doubt.ONE_DISTANCE:
-        row["depth_sum"] = zlib.crc32(np.ascontiguousarray(depth))
+        row["depth_sum"] = zlib.crc32(depth.tobytes())
     counts = depth_unit.counted_metres(depth, depth_unit.counting_scale(dataset.camera.depth_scale))
     return row, seen, counts, errors
 
@@ -96,7 +96,7 @@ def _judge_grey(grey: np.ndarray) -> dict[str, Any]:
         "saturated": float((grey >= SATURATED).mean()),
         "blur": blur_effect(grey),
         "corners": len(corners) * 640 * 480 / grey.size,
-        "picture_sum": zlib.crc32(np.ascontiguousarray(grey)) if int(grey.max()) > int(grey.min()) else -1,
+        "picture_sum": zlib.crc32(grey.tobytes()) if int(grey.max()) > int(grey.min()) else -1,
         "thumbnail": cv2.resize(grey, THUMBNAIL, interpolation=cv2.INTER_AREA).astype(np.float32),
     }
 

@@ -103,8 +103,8 @@ def same_pictures(features: Features) -> np.ndarray:
     return is_same
 
 
-def same_depth(coarse_depth: np.ndarray) -> np.ndarray:
-    """Find the frames (F,) whose coarse depth image (F, V, U) is that of the frame before, and not of one distance or empty."""
+def same_depth(coarse_depth: Sequence[np.ndarray]) -> np.ndarray:
+    """Find the frames (F,) whose coarse depth image (V, U) is that of the frame before, and not of one distance or empty."""
     is_same = np.zeros(len(coarse_depth), dtype=bool)
     for i in range(1, len(is_same)):
         if np.array_equal(coarse_depth[i], coarse_depth[i - 1]):

@@ -53,7 +53,7 @@ def test_points_seen_twice_are_rigid_under_the_right_focal_length_alone(factor: 
     """Found whatever the camera is believed to be, with a fifth of the matches false."""
     rng = np.random.default_rng(5)
     views = []
-    for k in range(6):
+    for _ in range(6):
         points = rng.uniform([-1.5, -1.2, 1.0], [1.5, 1.2, 4.0], (150, 3))
         T = se3.exp(rng.normal(0.0, [0.2, 0.2, 0.2, 0.15, 0.15, 0.15]))
         both = []
@@ -77,11 +77,17 @@ def test_too_few_points_say_nothing() -> None:
 
 def test_the_greatest_fault_is_named_alone_and_small_or_unsure_ones_never() -> None:
     sure, strong = {"sigma": 0.001, "explained": 0.3}, {"sigma": 0.001, "explained": 0.5}
-    found = {"focal": Deviation(0.05, **sure), "cx": Deviation(-0.05, **strong), "cy": Deviation(0.0, **sure), "k1": Deviation(0.2, 0.1, 0.5)}
+    found = {
+        "focal": Deviation(0.05, **sure),
+        "cx": Deviation(-0.05, **strong),
+        "cy": Deviation(0.0, **sure),
+        "k1": Deviation(0.2, 0.1, 0.5),
+    }
     assert [one.name for one in calibration_doubt.about(found, None, CAMERA)] == ["principal_point"]
     assert calibration_doubt.about({"focal": Deviation(0.05, 0.001, 0.03)}, None, CAMERA) == []
     assert calibration_doubt.about({"focal": Deviation(0.01, **sure)}, None, CAMERA) == []
     assert calibration_doubt.about({}, Rigidity(0.7, 1.1, 20), CAMERA) == []
     assert [one.name for one in calibration_doubt.about(found, Rigidity(0.5, 2.0, 20), CAMERA)] == ["focal_length"]
-    assert [one.name for one in calibration_doubt.about(dict.fromkeys(("shift_x", "shift_y"), Deviation(0.02, **sure)), None, CAMERA)] == ["depth_shift"]
-
+    assert [one.name for one in calibration_doubt.about(dict.fromkeys(("shift_x", "shift_y"), Deviation(0.02, **sure)), None, CAMERA)] == [
+        "depth_shift"
+    ]

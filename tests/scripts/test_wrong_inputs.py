@@ -10,9 +10,9 @@ from click.testing import Result
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "scripts"))
 
-import wrong_inputs  # noqa: E402
+import wrong_inputs
 
-from slamcli.runs.run_directory import RunDir  # noqa: E402
+from slamcli.runs.run_directory import RunDir
 
 Slamcli = Callable[..., Result]
 # Said by the first stage; the others by the optimized map, or when the recording is opened.
