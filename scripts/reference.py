@@ -117,7 +117,8 @@ def artefacts_page() -> Iterator[str]:
         yield "| array | type | shape | meaning |\n|---|---|---|---|"
         for field in dataclasses.fields(record):
             shape = " x ".join(field.metadata["shape"]) or "scalar"
-            yield f"| `{field.name}` | {field.metadata['dtype']} | {shape} | {_cell(field.metadata['meaning'])} |"
+            kinds = " or ".join(str(kind) for kind in (*field.metadata["narrow"], field.metadata["dtype"]))
+            yield f"| `{field.name}` | {kinds} | {shape} | {_cell(field.metadata['meaning'])} |"
         yield ""
 
 

@@ -1,5 +1,6 @@
 """Records of arrays as folders of `.npy`, one file a field. A record's type is its schema; it is checked at every save and load."""
 
+from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
 from tokenize import TokenError
@@ -22,7 +23,7 @@ def check(value: Any) -> None:
     for spec in fields(value):
         column = np.asarray(getattr(value, spec.name))
         name, dtype, shape = f"{type(value).__name__}.{spec.name}", spec.metadata["dtype"], spec.metadata["shape"]
-        if column.dtype != dtype:
+        if column.dtype not in (dtype, *spec.metadata["narrow"]):
             raise ValueError(f"{name}: dtype {column.dtype} is not {dtype}")
         if len(column.shape) != len(shape) or not all(_fits(n, symbol, bound) for n, symbol in zip(column.shape, shape, strict=True)):
             raise ValueError(f"{name}: shape {column.shape} does not fit {list(shape)} with {bound}")
@@ -43,10 +44,19 @@ def save(value: Any, folder: Path) -> None:
         path = Path(folder) / f"{spec.name}.npy"
         if path.exists():
             raise ValueError(f"{type(value).__name__}.{spec.name}: {path} is already written by another type")
-        column = np.asarray(getattr(value, spec.name), order="C")
+        column = _narrowest(np.asarray(getattr(value, spec.name), order="C"), spec.metadata["narrow"])
         with files.written(path), open(path, "xb") as file:
             np.lib.format.write_array_header_1_0(file, np.lib.format.header_data_from_array_1_0(column))
             file.write(column.reshape(-1).view(np.uint8).data)  # numpy's own way hides why a write fails
+
+
+def _narrowest(column: np.ndarray, narrow: Sequence[np.dtype]) -> np.ndarray:
+    """Return a column in the first of these whole-number types that holds all its values, as it is where none does."""
+    least, most = int(column.min(initial=0)) if narrow else 0, int(column.max(initial=0)) if narrow else 0
+    for dtype in narrow:
+        if np.iinfo(dtype).min <= least and most <= np.iinfo(dtype).max:
+            return column.astype(dtype)
+    return column
 
 
 def file_names(cls: type) -> list[str]:

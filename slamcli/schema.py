@@ -1,6 +1,6 @@
 """The core types. Each is a frozen record of arrays and, saved as a folder of `.npy`, also an artefact's schema.
 
-F frames, V x U coarse pixels, M features, P pairs, Q matches, W words, B word-vector entries, K key frames, L landmarks, O observations, E edges, C closures.
+F frames, V x U coarse pixels, M features, P pairs, Q matches, W words, K key frames, L landmarks, O observations, E edges, C closures.
 v x u blocks of a view, H x W cells of the grid, N poses of a trajectory.
 Missing values: depth and pose NaN, index -1. `offset` columns delimit ragged rows: those of frame i are offset[i]:offset[i+1].
 """
@@ -10,16 +10,17 @@ from typing import Any
 
 import numpy as np
 
-FORMAT = 6  # of everything a run directory holds; raised whenever an array changes its meaning
+FORMAT = 7  # of everything a run directory holds; raised whenever an array changes its meaning
 
 
-def array(dtype: str, shape: str, meaning: str, *, may_lack: bool = False) -> Any:
+def array(dtype: str, shape: str, meaning: str, *, may_lack: bool = False, narrow: str = "") -> Any:
     """Declare a field: numpy dtype, symbolic shape such as "M 2" or "F+1" ("" for a scalar), meaning with unit.
 
     may_lack : where the field is not given, it has no rows
+    narrow : whole-number dtypes such as "u1 u2", the narrowest first: it is saved, and loaded, as the first of them that holds all values
     """
     symbols = tuple(shape.split())
-    metadata = {"dtype": np.dtype(dtype), "shape": symbols, "meaning": meaning}
+    metadata = {"dtype": np.dtype(dtype), "narrow": tuple(np.dtype(one) for one in narrow.split()), "shape": symbols, "meaning": meaning}
     if may_lack:
         return field(default_factory=lambda: np.zeros([int(s) if s.isdigit() else 0 for s in symbols], dtype), metadata=metadata)
     return field(metadata=metadata)
@@ -59,16 +60,14 @@ class Flow:
 
 @dataclass(frozen=True)
 class Words:
-    """The visual words of every feature and the word vector of every frame, by match."""
+    """The visual words of every feature, by match. With the words' weights they make a frame's bag-of-words vector."""
 
     idf: np.ndarray = array("f4", "W", "inverse document frequency of each word of the vocabulary")
-    word: np.ndarray = array("i4", "M", "word of each feature row")
+    word_offset: np.ndarray = array("i8", "F+1", "feature rows of a frame")
+    word: np.ndarray = array("i4", "M", "word of each feature row", narrow="u2")
     node: np.ndarray = array(
-        "i4", "M 2", "vocabulary nodes near the root: features under one node are compared; the second may be -1, none"
+        "i4", "M 2", "vocabulary nodes near the root: features under one node are compared; the second may be -1, none", narrow="i1 i2"
     )
-    bow_offset: np.ndarray = array("i8", "F+1", "word-vector rows of a frame")
-    bow_word: np.ndarray = array("i4", "B", "increasing within a frame")
-    bow_weight: np.ndarray = array("f4", "B", "tf-idf, sums to 1 within a frame (L1)")
 
 
 @dataclass(frozen=True)
@@ -77,8 +76,7 @@ class Matches:
 
     pair: np.ndarray = array("i4", "P 2", "frames (i, j), j < i, sorted")
     offset: np.ndarray = array("i8", "P+1", "match rows of a pair")
-    row: np.ndarray = array("i4", "Q 2", "feature index within frame i and within frame j")
-    distance: np.ndarray = array("u1", "Q", "Hamming distance, bits")
+    row: np.ndarray = array("i4", "Q 2", "feature index within frame i and within frame j", narrow="u2")
 
 
 LOST, TRACKED, KEY_FRAME, RELOCALIZED, ON_DEPTH = range(5)  # values of Tracks.state

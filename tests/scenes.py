@@ -118,19 +118,11 @@ def flip_bits(desc: np.ndarray, n: int, rng: np.random.Generator) -> np.ndarray:
 
 def words_of(landmark: np.ndarray, offset: np.ndarray, n_words: int) -> Words:
     """Return every landmark a word of its own."""
-    word, weight, bow_offset = [], [], [0]
-    for a, b in zip(offset[:-1], offset[1:], strict=True):
-        ids = np.unique(landmark[a:b])
-        word.append(ids)
-        weight.append(np.full(len(ids), 1.0 / max(len(ids), 1)))
-        bow_offset.append(bow_offset[-1] + len(ids))
     return Words(
         idf=np.ones(n_words, np.float32),
+        word_offset=np.array(offset, np.int64),
         word=landmark.astype(np.int32),
         node=(landmark // 4).astype(np.int32),
-        bow_offset=np.array(bow_offset, np.int64),
-        bow_word=np.concatenate(word).astype(np.int32),
-        bow_weight=np.concatenate(weight).astype(np.float32),
     )
 
 
@@ -145,12 +137,7 @@ def matches_of(landmark: np.ndarray, offset: np.ndarray) -> Matches:
         rows.append(np.stack([row_i, row_j], axis=1))
         start.append(start[-1] + len(row_i))
     joined = np.concatenate(rows) if rows else np.empty((0, 2))
-    return Matches(
-        pair=np.array(pair, np.int32).reshape(-1, 2),
-        offset=np.array(start, np.int64),
-        row=joined.astype(np.int32),
-        distance=np.zeros(len(joined), np.uint8),
-    )
+    return Matches(pair=np.array(pair, np.int32).reshape(-1, 2), offset=np.array(start, np.int64), row=joined.astype(np.int32))
 
 
 def ape(T_wc: np.ndarray, T_gc: np.ndarray) -> float:

@@ -143,6 +143,25 @@ def test_a_missing_file_gives_one_line_that_names_it(tmp_path: Path) -> None:
         artifacts.load(Ragged, tmp_path)
 
 
+@dataclass(frozen=True)
+class Narrowed:
+    """A type whose values are saved as narrowly as they fit."""
+
+    row: np.ndarray = array("i4", "M", "index", narrow="i1 u2")
+
+
+@pytest.mark.parametrize(
+    ("values", "dtype"),
+    [([], "i1"), ([-1, 127], "i1"), ([-128], "i1"), ([128], "u2"), ([0, 65535], "u2"), ([-1, 128], "i4"), ([-129], "i4"), ([65536], "i4")],
+)
+def test_whole_numbers_are_saved_in_the_first_type_that_holds_them_all(tmp_path: Path, values: list[int], dtype: str) -> None:
+    artifacts.save(Narrowed(np.array(values, np.int32)), tmp_path)
+    row = artifacts.load(Narrowed, tmp_path).row
+    assert row.dtype == dtype and row.tolist() == values
+    with pytest.raises(ValueError, match=r"Narrowed.row: dtype int64 is not int32"):
+        artifacts.check(Narrowed(np.array(values, np.int64)))
+
+
 def test_every_core_type_declares_dtype_shape_and_meaning_of_each_field() -> None:
     types = [value for value in vars(schema).values() if dataclasses.is_dataclass(value)]
     assert len(types) >= 8

@@ -48,7 +48,7 @@ class PreviousFrame:
         pair = self._pair_of.get((i, i - 1))
         if pair is None or self.features is None:
             return Correspondences(np.empty(0, np.int32), np.empty((0, 3)), np.empty(0, np.int32))
-        match = self._matches.row[self._matches.offset[pair] : self._matches.offset[pair + 1]]
+        match = self._matches.row[self._matches.offset[pair] : self._matches.offset[pair + 1]].astype(np.int32)
         ids = self._sparse_map.resolve(self.landmark[match[:, 1]])
         x_w = se3.transform(T_wp, self._camera.backproject(self.features.xy[match[:, 1]], self.features.depth[match[:, 1]]))
         x_w[ids >= 0] = self._sparse_map.lm.xyz[ids[ids >= 0]]

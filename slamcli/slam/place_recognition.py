@@ -3,13 +3,13 @@
 import numpy as np
 
 from slamcli.schema import Words
-from slamcli.vision.bag_of_words import InvertedIndex
+from slamcli.vision.bag_of_words import InvertedIndex, word_vector
 
 
 def bow_vector(words: Words, frame: int) -> tuple[np.ndarray, np.ndarray]:
-    """Look up the bag-of-words vector of one frame: words (B,) and their weights (B,)."""
-    span = slice(int(words.bow_offset[frame]), int(words.bow_offset[frame + 1]))
-    return np.array(words.bow_word[span]), np.array(words.bow_weight[span])
+    """Return the bag-of-words vector of one frame: words (B,) and their weights (B,)."""
+    rows = slice(int(words.word_offset[frame]), int(words.word_offset[frame + 1]))
+    return word_vector(words.word[rows], words.idf)
 
 
 class PlaceIndex:

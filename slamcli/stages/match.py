@@ -1,4 +1,4 @@
-"""match: features -> visual words, word vectors, and matches between neighbouring frames. Needs no pose."""
+"""match: features -> visual words and matches between neighbouring frames. Needs no pose."""
 
 from functools import partial
 from pathlib import Path
@@ -12,11 +12,11 @@ from slamcli.formats import vocabulary_file
 from slamcli.parallel import ordered_map
 from slamcli.schema import Features, Flow, Matches, Words
 from slamcli.stages.contract import Inputs, Summary, Tools
-from slamcli.vision import bag_of_words, hamming, optical_flow, vocabulary
+from slamcli.vision import hamming, optical_flow, vocabulary
 
 
 def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
-    """Quantize every feature, make the frames' word vectors, match each frame to those before it."""
+    """Quantize every feature, match each frame to those before it."""
     features, settings = inputs.load(Features, "extract"), cfg.match
     words = _words(features, vocabulary_file.read(settings.vocabulary), settings)
     pairs = [(i, j) for i in range(len(features.stamp)) for j in range(max(0, i - settings.window), i)]
@@ -25,9 +25,8 @@ def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
     found = list(tools.progress(ordered_map(match, pairs, workers=tools.workers), "match", len(pairs)))
     matches = Matches(
         pair=np.array(pairs, dtype=np.int32).reshape(-1, 2),
-        offset=np.cumsum([0] + [len(rows) for rows, _ in found], dtype=np.int64),
-        row=np.concatenate([np.zeros((0, 2), np.int32), *(rows for rows, _ in found)]),
-        distance=np.concatenate([np.zeros(0, np.uint8), *(distance for _, distance in found)]),
+        offset=np.cumsum([0] + [len(rows) for rows in found], dtype=np.int64),
+        row=np.concatenate([np.zeros((0, 2), np.int32), *found]),
     )
     artifacts.save(words, out)
     artifacts.save(matches, out)
@@ -36,35 +35,35 @@ def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
         "pairs": len(pairs),
         "matches_per_pair": float(np.median(np.diff(matches.offset))) if pairs else 0.0,
         "words": len(words.idf),
-        "words_seen": len(np.unique(words.bow_word)),
+        "words_seen": int((words.idf[np.unique(words.word)] > 0).sum()),
     }
 
 
 def _words(features: Features, words: vocabulary.Vocabulary, settings: MatchConfig) -> Words:
     word, node = vocabulary.quantize(words, features.desc, node_level=settings.node_level, margin=settings.node_margin)
-    bow_offset, bow_word, bow_weight = bag_of_words.word_vectors(word, features.offset, words.idf)
-    return Words(idf=words.idf, word=word, node=node, bow_offset=bow_offset, bow_word=bow_word, bow_weight=bow_weight)
+    return Words(idf=words.idf, word_offset=np.array(features.offset), word=word, node=node)
 
 
 def _match(
     features: Features, words: Words, flowed: np.ndarray, settings: MatchConfig, pair: tuple[int, int]
-) -> tuple[np.ndarray, np.ndarray]:
-    rows, distance = _match_descriptors(features, words, settings, pair)
+) -> np.ndarray:
+    rows = _match_descriptors(features, words, settings, pair)
     if len(flowed) == 0 or len(rows) >= settings.flow_below or pair[0] - pair[1] != 1:
-        return rows, distance
+        return rows
     i, j = (slice(int(features.offset[frame]), int(features.offset[frame + 1])) for frame in pair)
     is_free_i, is_free_j = np.ones(i.stop - i.start, dtype=bool), np.ones(j.stop - j.start, dtype=bool)
     is_free_i[rows[:, 0]] = is_free_j[rows[:, 1]] = False
     more = optical_flow.match(features.xy[i], flowed[j], is_free_i=is_free_i, is_free_j=is_free_j, radius=settings.flow_radius)
-    bits = np.unpackbits(features.desc[i][more[:, 0]] ^ features.desc[j][more[:, 1]], axis=1).sum(axis=1)
-    return np.concatenate([rows, more]), np.concatenate([distance, bits.clip(0, 255).astype(np.uint8)])
+    return np.concatenate([rows, more])
 
 
-def _match_descriptors(features: Features, words: Words, settings: MatchConfig, pair: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+def _match_descriptors(features: Features, words: Words, settings: MatchConfig, pair: tuple[int, int]) -> np.ndarray:
     i, j = (slice(int(features.offset[frame]), int(features.offset[frame + 1])) for frame in pair)
     checks: Any = {"max_distance": settings.max_distance, "ratio": settings.ratio, "check_rotation": settings.check_rotation}
     if settings.method == "brute":
-        return hamming.match_brute(features.desc[i], features.desc[j], features.angle[i], features.angle[j], **checks)
-    return hamming.match_nodes(
-        features.desc[i], words.node[i], features.desc[j], words.node[j], features.angle[i], features.angle[j], **checks
-    )
+        rows, _ = hamming.match_brute(features.desc[i], features.desc[j], features.angle[i], features.angle[j], **checks)
+    else:
+        rows, _ = hamming.match_nodes(
+            features.desc[i], words.node[i], features.desc[j], words.node[j], features.angle[i], features.angle[j], **checks
+        )
+    return rows

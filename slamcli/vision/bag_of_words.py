@@ -20,15 +20,6 @@ def word_vector(word: np.ndarray, idf: np.ndarray) -> tuple[np.ndarray, np.ndarr
     return present.astype(np.int32), (weight / weight.sum()).astype(np.float32) if len(weight) else weight.astype(np.float32)
 
 
-def word_vectors(word: np.ndarray, offset: np.ndarray, idf: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the word vectors of all frames: offset (F + 1,) int64, word (B,) int32, weight (B,) float32; `offset` delimits the frames' features."""
-    vectors = [word_vector(word[start:stop], idf) for start, stop in zip(offset[:-1], offset[1:], strict=True)]
-    bow_offset = np.cumsum([0] + [len(words) for words, _ in vectors], dtype=np.int64)
-    if not vectors:
-        return bow_offset, np.zeros(0, dtype=np.int32), np.zeros(0, dtype=np.float32)
-    return bow_offset, np.concatenate([words for words, _ in vectors]), np.concatenate([weights for _, weights in vectors])
-
-
 @kernel
 def _link(
     word: i4[::1], weight: f4[::1], frame: i8, head: i4[::1], following: i4[::1], posting_frame: i4[::1], posting_weight: f4[::1], n: i8

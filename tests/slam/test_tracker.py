@@ -94,7 +94,7 @@ def with_rows(matches: Matches, frame: int, rows: np.ndarray) -> Matches:
         rows if i == frame else matches.row[a:b] for (i, _), a, b in zip(matches.pair, matches.offset, matches.offset[1:], strict=False)
     ]
     offset = np.cumsum([0, *map(len, parts)])
-    return Matches(pair=matches.pair, offset=offset, row=np.concatenate(parts), distance=np.zeros(offset[-1], np.uint8))
+    return Matches(pair=matches.pair, offset=offset, row=np.concatenate(parts))
 
 
 def turn_about_y(angle: float) -> np.ndarray:

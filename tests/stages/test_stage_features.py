@@ -16,6 +16,7 @@ from slamcli.depth import at_key_points
 from slamcli.errors import SlamError
 from slamcli.geometry.camera import Camera
 from slamcli.schema import Features, Flow, Matches, Words
+from slamcli.slam.place_recognition import bow_vector
 from slamcli.stages import extract, match
 from slamcli.vision import hamming, orb
 
@@ -129,7 +130,7 @@ def test_frames_that_cannot_be_used_are_skipped_and_counted(tmp_path: Path) -> N
     assert summary["bad_images"] == len(warnings) == 3
     assert colour[1].name in warnings[0] and "frame 1" in warnings[0]
     words, matches, _ = run_match(features, tmp_path / "match")
-    assert np.diff(words.bow_offset)[1] == 0
+    assert np.diff(words.word_offset)[1] == 0
     assert len(matches.pair) == 5 and np.diff(matches.offset)[[0, 1]].tolist() == [0, 0]
 
 
@@ -160,15 +161,17 @@ def test_words_and_matches_keep_their_promises(features: Features, tmp_path: Pat
     assert summary["pairs"] == len(matches.pair) == 3 * n_frames - 6
     assert (matches.pair[:, 1] < matches.pair[:, 0]).all() and (matches.pair[:, 0] - matches.pair[:, 1] <= 3).all()
     assert [tuple(p) for p in matches.pair] == sorted(tuple(p) for p in matches.pair)
-    assert (matches.distance <= 64).all()
+    assert words.word.dtype == matches.row.dtype == np.uint16 and words.node.dtype == np.int8  # as narrow as the values allow
     for p, (i, j) in enumerate(matches.pair[:9]):
         rows = matches.row[matches.offset[p] : matches.offset[p + 1]]
         assert len(np.unique(rows[:, 0])) == len(np.unique(rows[:, 1])) == len(rows)
+        bits = np.bitwise_count(features.desc[features.offset[i] + rows[:, 0]] ^ features.desc[features.offset[j] + rows[:, 1]]).sum(axis=1)
+        assert bits.max() <= 64
         assert (rows < [features.offset[i + 1] - features.offset[i], features.offset[j + 1] - features.offset[j]]).all()
     for f in range(n_frames):
-        span = slice(words.bow_offset[f], words.bow_offset[f + 1])
-        assert (np.diff(words.bow_word[span]) > 0).all()
-        assert words.bow_weight[span].sum() == pytest.approx(1.0, abs=1e-4)
+        word, weight = bow_vector(words, f)
+        assert len(word) and (np.diff(word) > 0).all()
+        assert weight.sum() == pytest.approx(1.0, abs=1e-4)
 
 
 def test_words_find_nearly_what_brute_force_finds(features: Features, tmp_path: Path) -> None:

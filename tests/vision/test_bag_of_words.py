@@ -3,7 +3,6 @@
 import naive
 import numpy as np
 import pytest
-import word_groups
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -21,18 +20,6 @@ def test_a_word_vector_sums_to_one_and_leaves_out_words_of_no_weight() -> None:
     for empty in (np.zeros(0, np.int32), np.zeros(4, np.int32)):
         word, weight = bag_of_words.word_vector(empty, idf)
         assert len(word) == len(weight) == 0 and weight.dtype == np.float32
-
-
-def test_word_vectors_of_frames_are_those_of_each() -> None:
-    small = word_groups.tree()
-    word = np.random.default_rng(0).integers(0, small.n_words, 50).astype(np.int32)
-    offset = np.array([0, 20, 20, 50])
-    bow_offset, bow_word, bow_weight = bag_of_words.word_vectors(word, offset, small.idf)
-    for f in range(3):
-        expected = bag_of_words.word_vector(word[offset[f] : offset[f + 1]], small.idf)
-        span = slice(bow_offset[f], bow_offset[f + 1])
-        np.testing.assert_array_equal(bow_word[span], expected[0])
-        np.testing.assert_array_equal(bow_weight[span], expected[1])
 
 
 @settings(max_examples=40, deadline=None)
