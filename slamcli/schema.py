@@ -1,6 +1,6 @@
 """The core types. Each is a frozen record of arrays and, saved as a folder of `.npy`, also an artefact's schema.
 
-F frames, V x U coarse pixels, M features, P pairs, Q matches, W words, K key frames, L landmarks, O observations, E edges, C closures.
+F frames, M features, P pairs, Q matches, W words, K key frames, L landmarks, O observations, E edges, C closures.
 v x u blocks of a view, H x W cells of the grid, N poses of a trajectory.
 Missing values: depth and pose NaN, index -1. `offset` columns delimit ragged rows: those of frame i are offset[i]:offset[i+1].
 """
@@ -46,7 +46,9 @@ class Features:
 class CoarseDepth:
     """Coarse depth images, by extract: enough to align shapes, on which places without texture are tracked."""
 
-    coarse_depth: np.ndarray = array("u2", "F V U", "2e-4 m along the optical axis, of the middle of a block of pixels, 0 = none")
+    coarse_shape: np.ndarray = array("i4", "2", "rows and columns of an image; a pixel is the middle of a block of pixels")
+    coarse_offset: np.ndarray = array("i8", "F+1", "bytes of a frame")
+    coarse_code: np.ndarray = array("u1", "C", "images of uint16, 2e-4 m along the optical axis, 0 = none, in RVL code (formats/rvl.py)")
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ from scenes import CAMERA
 
 from slamcli import artifacts
 from slamcli.config.options import LoopConfig, OptimizeConfig, SensorConfig, TrackConfig
+from slamcli.depth.coarse_images import encode
 from slamcli.files import read_json
 from slamcli.geometry.camera import Camera
 from slamcli.schema import CoarseDepth, Features, Map, Matches, Tracks, Words
@@ -22,7 +23,7 @@ class Run:
         optimize = optimize or OptimizeConfig()
         self.workers = 2
         self.cfg = SimpleNamespace(track=TrackConfig(), sensor=SENSOR, optimize=optimize, loop=LoopConfig(**loop_settings))
-        self.depth = CoarseDepth(np.zeros((len(scene.features.stamp), 0, 0), np.uint16))
+        self.depth = encode(np.zeros((len(scene.features.stamp), 0, 0), np.uint16), (0, 0))
         self.warn, self.summary = self.warnings.append, {}
 
     def load(self, cls, stage):

@@ -5,13 +5,14 @@ the lowest first, each in a nibble whose top bit says that another follows; nibb
 """
 
 import numpy as np
-from numba import i8, u1, u2
+from numba import i8, u1, u2, u4
 
 from slamcli.errors import SlamError
 from slamcli.jit.kernel import kernel
 
 MOST_PIXELS_PER_BYTE = 500_000  # a run of zeros takes a few nibbles whatever its length; this bounds a hostile size
 MAX_PIXELS = 100_000_000
+MOST_NIBBLES = 7  # a pixel: 6 for a difference of 17 bits with its sign, and the lengths of runs
 
 
 def decode(data: bytes, width: int, height: int) -> np.ndarray:
@@ -24,6 +25,46 @@ def decode(data: bytes, width: int, height: int) -> np.ndarray:
     if unpack(padded, out) != n:
         raise SlamError("RVL image is damaged or cut off")
     return out.reshape(height, width)
+
+
+def encode(image: np.ndarray) -> bytes:
+    """Encode an image (H, W) uint16; `decode` inverts it."""
+    values = np.ascontiguousarray(image, dtype=np.uint16).ravel()
+    words = np.zeros(MOST_NIBBLES * len(values) // 8 + 3, dtype=np.uint32)
+    return words[: pack(values, words)].astype("<u4", copy=False).tobytes()
+
+
+@kernel
+def pack(values: u2[::1], words: u4[::1]) -> i8:
+    """Encode into `words`, zeros before; returns how many the code takes."""
+    n, at, start, previous = len(values), 0, 0, 0
+    while start < n:
+        first = start
+        while first < n and values[first] == 0:
+            first += 1
+        stop = first
+        while stop < n and values[stop] != 0:
+            stop += 1
+        at = put(words, at, first - start)
+        at = put(words, at, stop - first)
+        for k in range(first, stop):
+            delta = i8(values[k]) - previous
+            at = put(words, at, (delta << 1) ^ (delta >> 63))
+            previous = i8(values[k])
+        start = stop
+    return (at + 7) >> 3
+
+
+@kernel
+def put(words, at, value):
+    """Write one number at nibble `at`; returns the next nibble."""
+    while True:
+        nibble, value = value & 7, value >> 3
+        nibble |= 8 if value else 0
+        words[at >> 3] |= u4(nibble << (4 * (7 - (at & 7))))
+        at += 1
+        if value == 0:
+            return at
 
 
 @kernel

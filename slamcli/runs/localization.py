@@ -14,12 +14,13 @@ from slamcli.errors import SlamError
 from slamcli.files import scratch
 from slamcli.runs.pipeline import Pipeline
 from slamcli.runs.run_directory import RunDir
-from slamcli.schema import LOST, CoarseDepth, Features, Map, Matches, Timing, Tracks, Trajectory, Words, trajectory
+from slamcli.schema import LOST, Features, Map, Matches, Timing, Tracks, Trajectory, Words, trajectory
 from slamcli.slam import final_refinement
 from slamcli.slam.depth_tracking import FramePoints
 from slamcli.slam.localizer import Localizer
 from slamcli.slam.place_recognition import PlaceIndex
 from slamcli.sparse_map.sparse_map import SparseMap
+from slamcli.stages.moving_parts import coarse_images
 
 LOOKS = 2  # at all frames with hindsight: the motion that rectifies them comes from the look before
 
@@ -77,8 +78,8 @@ def _find(run: RunDir, new: RunDir, config: Config, progress: Progress) -> Local
         config.track,
         config.sensor,
         np.random.default_rng(config.seed),
-        frame_points=FramePoints(new.load(CoarseDepth, "extract"), new.camera(), config.sensor).under(camera),
-        map_frame_points=FramePoints(run.load(CoarseDepth, "extract"), given, config.sensor).under(run.camera("loop")),
+        frame_points=FramePoints(coarse_images(new), new.camera(), config.sensor).under(camera),
+        map_frame_points=FramePoints(coarse_images(run), given, config.sensor).under(run.camera("loop")),
     )
     for i in progress(range(len(features.stamp)), "localize"):
         localizer.process(i)

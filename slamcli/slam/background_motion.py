@@ -18,6 +18,7 @@ import numpy as np
 
 from slamcli.config.options import SensorConfig
 from slamcli.depth import icp, icp_kernels
+from slamcli.depth.coarse_images import CoarseImages
 from slamcli.depth.icp import OrientedPoints, Pass, PosePrior
 from slamcli.estimation import camera_pose, minimal_solvers
 from slamcli.estimation.camera_pose import PoseEstimate
@@ -78,9 +79,9 @@ class BackgroundMotion:
     """Estimates the camera's motion against the static world between frames of a recording."""
 
     def __init__(
-        self, features: Features, words: Words, depth: np.ndarray, camera: Camera, sensor: SensorConfig, rng: np.random.Generator
+        self, features: Features, words: Words, depth: CoarseImages, camera: Camera, sensor: SensorConfig, rng: np.random.Generator
     ) -> None:
-        """Take the features and coarse depth images (F, V, U) of a recording."""
+        """Take the features, their words and the coarse depth images of a recording."""
         self._features, self._words, self._depth, self._camera, self._sensor, self._rng = features, words, depth, camera, sensor, rng
         self._pinhole = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
         self._frame_points: OrderedDict[int, OrientedPoints] = OrderedDict()

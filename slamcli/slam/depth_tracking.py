@@ -9,11 +9,11 @@ import numpy as np
 
 from slamcli.config.options import SensorConfig
 from slamcli.depth import icp
+from slamcli.depth.coarse_images import CoarseImages
 from slamcli.depth.icp import Alignment, OrientedPoints, PosePrior
 from slamcli.geometry import se3
 from slamcli.geometry.camera import Camera
 from slamcli.parallel import ordered_map
-from slamcli.schema import CoarseDepth
 from slamcli.sparse_map.sparse_map import SparseMap
 
 LEAST_POINTS = 0.05  # share of the coarse pixels that must show a surface
@@ -29,15 +29,15 @@ JOIN_MOST = 5  # edges of a new key frame to earlier ones: more of them hold dow
 class FramePoints:
     """The oriented points of each frame of a recording; those used last are kept. Several threads may ask at once."""
 
-    def __init__(self, depth: CoarseDepth, given: Camera, sensor: SensorConfig, *, camera: Camera | None = None) -> None:
+    def __init__(self, images: CoarseImages, given: Camera, sensor: SensorConfig, *, camera: Camera | None = None) -> None:
         """Take the coarse depth images, read under the calibration `given`; camera : what is known of the camera, if more."""
-        self._depth, self._given, self._camera, self._sensor = depth, given, camera or given, sensor
+        self._images, self._given, self._camera, self._sensor = images, given, camera or given, sensor
         self._kept: OrderedDict[int, OrientedPoints | None] = OrderedDict()
         self._lock = Lock()
 
     def under(self, camera: Camera) -> "FramePoints":
         """Return the points as another calibration of the same camera gives them."""
-        return self if camera == self._camera else FramePoints(self._depth, self._given, self._sensor, camera=camera)
+        return self if camera == self._camera else FramePoints(self._images, self._given, self._sensor, camera=camera)
 
     def of(self, frame: int) -> OrientedPoints | None:
         """Return the points of a frame, None where it shows too little."""
@@ -53,7 +53,7 @@ class FramePoints:
         return found
 
     def _make(self, frame: int) -> OrientedPoints | None:
-        images = self._depth.coarse_depth
+        images = self._images
         if not 0 <= frame < len(images) or not images[frame].any():
             return None
         points = icp.surface_points(images[frame], self._camera, self._sensor, given=self._given)

@@ -15,9 +15,10 @@ import cv2
 import numpy as np
 
 from slamcli.depth import icp
+from slamcli.depth.coarse_images import CoarseImages
 from slamcli.geometry import se3
 from slamcli.geometry.camera import Camera
-from slamcli.schema import CoarseDepth, Features
+from slamcli.schema import Features
 from slamcli.slam import moving_object_kernels as kernels
 
 STEP = 2  # coarse pixels from one place looked at to the next
@@ -41,7 +42,7 @@ OUT_OF_SIGHT = -1e4  # [px] where no search looks
 class Views:
     """The coarse depth images of a recording and where they were taken."""
 
-    depth: np.ndarray  # (F, V, U) uint16 as in CoarseDepth
+    depth: CoarseImages
     stamp: np.ndarray  # (F,) [s]
     T_wc: np.ndarray  # (F, 4, 4) camera to world, NaN = unknown
     world: np.ndarray  # (F,) which world a pose is in: those of two cannot be compared
@@ -145,7 +146,7 @@ def weigh(views: Views, frame: int, after: tuple[float, ...]) -> Evidence | None
     T = np.ascontiguousarray(se3.inverse(views.T_wc[others]) @ views.T_wc[frame])
     pinhole = np.array([small.fx, small.fy, small.cx, small.cy])
     seen = np.zeros((len(others), *shape(views.camera)), dtype=np.uint8)
-    images = np.ascontiguousarray(views.depth[others])
+    images = views.depth.of(others)
     kernels.compare(z, kernels.smooth_places(z, SMOOTH), STEP, images, place, T, pinhole, TOLERANCE, icp.UNIT, seen)
     is_long = np.abs(views.stamp[others] - views.stamp[frame]) >= LONG
     rows, columns = seen.shape[1:]
@@ -189,16 +190,18 @@ def hide_features(features: Features, moving: np.ndarray, camera: Camera) -> Fea
     return replace(features, xy=xy, depth=depth)
 
 
-def hide_coarse(depth: CoarseDepth, moving: np.ndarray, camera: Camera) -> CoarseDepth:
+def hide_coarse(images: CoarseImages, moving: np.ndarray, camera: Camera) -> CoarseImages:
     """Remove what moves from the coarse depth images; `moving` as in `hide_features`."""
     if len(moving) == 0:
-        return depth
+        return images
     small, _ = icp.coarse_camera(camera)
     lookup = _lookup(small, STEP, moving.shape[1:])
-    images = np.array(depth.coarse_depth)
-    for image, mask in zip(images, moving, strict=True):
-        image[np.append(with_margin(mask).ravel(), False)[lookup]] = 0
-    return CoarseDepth(coarse_depth=images)
+
+    def hide(frame: int, image: np.ndarray) -> np.ndarray:
+        image[np.append(with_margin(moving[frame]).ravel(), False)[lookup]] = 0
+        return image
+
+    return images.changed(hide)
 
 
 def hide_pixels(depth: np.ndarray, mask: np.ndarray, camera: Camera) -> np.ndarray:

@@ -11,7 +11,7 @@ from slamcli import artifacts, files
 from slamcli.config.options import Config, ExtractConfig
 from slamcli.datasets import Dataset, depth_unit
 from slamcli.datasets.recording import spread
-from slamcli.depth import at_key_points, icp
+from slamcli.depth import at_key_points, coarse_images, icp
 from slamcli.errors import BadFrame, SlamError
 from slamcli.geometry.camera import Camera
 from slamcli.parallel import ordered_map
@@ -160,11 +160,7 @@ def _table(dataset: Dataset, camera: Camera, found: list[Frame], scale: float) -
 
 
 def _coarse_table(camera: Camera, found: list[Frame]) -> CoarseDepth:
-    coarse = np.zeros((len(found), *icp.coarse_shape(camera)), dtype=np.uint16)
-    for i, frame in enumerate(found):
-        if frame.coarse is not None:
-            coarse[i] = frame.coarse
-    return CoarseDepth(coarse_depth=coarse)
+    return coarse_images.encode((frame.coarse for frame in found), icp.coarse_shape(camera))
 
 
 def _flow_table(dataset: Dataset, camera: Camera, found: list[Frame], tools: Tools) -> Flow:

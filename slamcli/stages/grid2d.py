@@ -16,9 +16,10 @@ from slamcli.navigation import grid, own_body
 from slamcli.navigation.driven import mark_driven
 from slamcli.navigation.grid_evidence import View, look
 from slamcli.navigation.robot_pose import planar_pose
-from slamcli.schema import CoarseDepth, Features, Grid, Ground, Map, Moving, Tracks, frame_poses
+from slamcli.schema import Features, Grid, Ground, Map, Moving, Tracks, frame_poses
 from slamcli.stages.contract import Inputs, Summary, Tools
 from slamcli.stages.depth_frames import PosedFrame, depth_poses, read_depth
+from slamcli.stages.moving_parts import coarse_images
 
 BODY_VIEWS = 60  # spread over the drive, in which the robot's own body is looked for
 
@@ -93,8 +94,7 @@ def _left_out(inputs: Inputs, poses: list[PosedFrame], cfg: Config, tools: Tools
 
 def _own_body(inputs: Inputs, poses: list[PosedFrame], camera: Camera, band_low: float) -> np.ndarray:
     chosen = [poses[k] for k in np.unique(np.linspace(0, len(poses) - 1, min(len(poses), BODY_VIEWS)).astype(int))] if poses else []
-    coarse = inputs.load(CoarseDepth, "extract").coarse_depth
-    units = np.stack([coarse[frame] for frame, _ in chosen]) if chosen else np.zeros((0, *coarse.shape[1:]), np.uint16)
+    units = coarse_images(inputs).of(frame for frame, _ in chosen)
     if not units.size:
         return np.zeros((camera.height, camera.width), dtype=bool)
     depth = np.where(units > 0, units * icp.UNIT, np.nan)

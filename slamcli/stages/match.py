@@ -44,9 +44,7 @@ def _words(features: Features, words: vocabulary.Vocabulary, settings: MatchConf
     return Words(idf=words.idf, word_offset=np.array(features.offset), word=word, node=node)
 
 
-def _match(
-    features: Features, words: Words, flowed: np.ndarray, settings: MatchConfig, pair: tuple[int, int]
-) -> np.ndarray:
+def _match(features: Features, words: Words, flowed: np.ndarray, settings: MatchConfig, pair: tuple[int, int]) -> np.ndarray:
     rows = _match_descriptors(features, words, settings, pair)
     if len(flowed) == 0 or len(rows) >= settings.flow_below or pair[0] - pair[1] != 1:
         return rows

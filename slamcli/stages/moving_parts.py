@@ -2,11 +2,12 @@
 
 import numpy as np
 
+from slamcli.depth.coarse_images import CoarseImages
 from slamcli.geometry.camera import Camera
 from slamcli.schema import CoarseDepth, Features, Map, Moving, Tracks, poses_in_segments
 from slamcli.slam import moving_objects
 from slamcli.slam.moving_objects import FOR_POSES, Rule, Views
-from slamcli.stages.contract import Inputs, Summary, Tools
+from slamcli.stages.contract import Inputs, Stored, Summary, Tools
 
 NOTHING = Moving()
 MOVES = 0.01  # share of a view, from which on a frame counts as one with moving objects in the summary
@@ -24,9 +25,14 @@ def find(inputs: Inputs, tracks: Tracks, map_: Map, tools: Tools, *, rule: Rule 
     return Moving(found) if found.any() else Moving()
 
 
-def still(inputs: Inputs, moving: Moving) -> tuple[Features, CoarseDepth]:
+def coarse_images(inputs: Stored) -> CoarseImages:
+    """Return the recording's coarse depth images."""
+    return CoarseImages(inputs.load(CoarseDepth, "extract"))
+
+
+def still(inputs: Inputs, moving: Moving) -> tuple[Features, CoarseImages]:
     """Return the recording's features and coarse depth without what moves."""
-    features, depth, camera = inputs.load(Features, "extract"), inputs.load(CoarseDepth, "extract"), inputs.camera()
+    features, depth, camera = inputs.load(Features, "extract"), coarse_images(inputs), inputs.camera()
     return moving_objects.hide_features(features, moving.moving, camera), moving_objects.hide_coarse(depth, moving.moving, camera)
 
 
@@ -45,4 +51,4 @@ def figures(moving: Moving) -> Summary:
 def views(inputs: Inputs, tracks: Tracks, map_: Map) -> Views:
     """Gather the coarse depth images with these poses."""
     stamp, (segment, T_wc) = inputs.load(Features, "extract").stamp, poses_in_segments(tracks, map_)
-    return Views(inputs.load(CoarseDepth, "extract").coarse_depth, np.asarray(stamp), T_wc, segment, inputs.camera())
+    return Views(coarse_images(inputs), np.asarray(stamp), T_wc, segment, inputs.camera())

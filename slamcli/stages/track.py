@@ -11,7 +11,6 @@ from slamcli.schema import (
     LOST,
     ON_DEPTH,
     RELOCALIZED,
-    CoarseDepth,
     Features,
     Matches,
     Moving,
@@ -63,10 +62,10 @@ def _find_background(inputs: Inputs, cfg: Config, tools: Tools) -> tuple[Moving,
 
     Once most of what moves is known, the motion is found again without it.
     """
-    words, depth, camera, moving = inputs.load(Words, "match"), inputs.load(CoarseDepth, "extract").coarse_depth, inputs.camera(), NOTHING
+    words, depth, camera, moving = inputs.load(Words, "match"), moving_parts.coarse_images(inputs), inputs.camera(), NOTHING
     for _ in range(BACKGROUND_ROUNDS):
         features, still = moving_parts.still(inputs, moving)
-        motion = BackgroundMotion(features, words, still.coarse_depth, camera, cfg.sensor, tools.rng())
+        motion = BackgroundMotion(features, words, still, camera, cfg.sensor, tools.rng())
         T_wc = motion.poses(lambda anchors: tools.progress(anchors, "background"))
         views = moving_objects.Views(depth, np.asarray(features.stamp), T_wc, np.zeros(len(T_wc), dtype=np.int64), camera)
         moving = Moving(moving_objects.find(views, lambda frames: tools.progress(frames, "moving objects")))

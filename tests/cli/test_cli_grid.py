@@ -11,6 +11,7 @@ from boxroom import HANGING, KINECT, kinect_noise, look_along, render, round_tri
 from slamcli import artifacts
 from slamcli.config.options import Config, GridConfig, RobotConfig
 from slamcli.depth import icp
+from slamcli.depth.coarse_images import encode
 from slamcli.errors import BadFrame
 from slamcli.formats import grid_map, octomap
 from slamcli.geometry import se3
@@ -198,7 +199,7 @@ class Inputs:
                 np.empty((0, 32), np.uint8),
                 np.array(1.2),
             ),
-            CoarseDepth: CoarseDepth(np.zeros((n, 0, 0), np.uint16)),
+            CoarseDepth: encode(np.zeros((n, 0, 0), np.uint16), (0, 0)),
             Moving: Moving(),
             Ground: Ground(T_lw, plane, np.array(0.01), np.array(0.9), np.array(is_found)),
             Timing: Timing(np.array(0.0), np.array(0.0), np.array(0.0), np.zeros((n, 6))),
@@ -250,7 +251,7 @@ def test_the_stage_leaves_out_the_robots_own_body_and_says_so(tmp_path):
     inputs = Inputs(tmp_path, T)
     coarse = np.zeros((len(T), 15, 20), np.uint16)
     coarse[:, 13:, 6:14] = round(0.6 / icp.UNIT)
-    inputs._values[CoarseDepth] = CoarseDepth(coarse)
+    inputs._values[CoarseDepth] = encode(coarse, (15, 20))
     _, _, tools = run_stage(tmp_path, inputs)
     assert any("own body" in warning for warning in tools.warnings)
     (tmp_path / "again").mkdir()

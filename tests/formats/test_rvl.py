@@ -36,6 +36,20 @@ def test_decoding_inverts_an_independent_encoder(values: list[int]) -> None:
     assert np.array_equal(rvl.decode(encode(raw), raw.shape[1], 1), raw)
 
 
+@settings(deadline=None, max_examples=60)
+@given(st.lists(st.one_of(st.just(0), st.sampled_from([1, 65535]), st.integers(1000, 1010)), min_size=1, max_size=300))
+def test_encoding_gives_the_bytes_of_an_independent_encoder(values: list[int]) -> None:
+    raw = np.array(values, dtype=np.uint16).reshape(1, -1)
+    assert rvl.encode(raw) == encode(raw)
+    assert np.array_equal(rvl.decode(rvl.encode(raw), raw.shape[1], 1), raw)
+
+
+@pytest.mark.parametrize("values", [[1, 65535] * 500, [0, 65535] * 500, [0, 1, 65535] * 500, [65535], [0], [0] * 3000 + [1]])
+def test_the_worst_images_have_room(values: list[int]) -> None:
+    raw = np.array(values, dtype=np.uint16).reshape(1, -1)
+    assert np.array_equal(rvl.decode(rvl.encode(raw), raw.shape[1], 1), raw)
+
+
 def test_cut_off_and_absurd_sizes_are_told() -> None:
     raw = np.random.default_rng(0).integers(0, 5000, (20, 30)).astype(np.uint16)
     data = encode(raw)

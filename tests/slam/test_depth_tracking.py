@@ -5,14 +5,15 @@ from functools import cache
 import numpy as np
 import pytest
 from boxroom import FURNITURE, look_along, render
-from kinect import KINECT, noisy
+from kinect import KINECT, coded, noisy
 from scenes import ape
 
 from slamcli.calibration.self_calibration import Sensing
 from slamcli.config.options import LoopConfig, SensorConfig, TrackConfig
 from slamcli.depth import icp
+from slamcli.depth.coarse_images import CoarseImages
 from slamcli.geometry import se3
-from slamcli.schema import KEY_FRAME, LOST, ON_DEPTH, CoarseDepth, Features, Matches, Timing, Tracks, Words, frame_poses
+from slamcli.schema import KEY_FRAME, LOST, ON_DEPTH, Features, Matches, Timing, Tracks, Words, frame_poses
 from slamcli.slam import final_refinement, loop_pose_graph
 from slamcli.slam.depth_tracking import DepthAligner, FramePoints
 from slamcli.slam.tracker import Tracker
@@ -30,8 +31,8 @@ def turn(n: int, start: float = 3.6, step: float = 0.05) -> np.ndarray:
 
 
 @cache
-def corner(n: int = 14) -> CoarseDepth:
-    return CoarseDepth(np.stack([icp.coarsen(noisy(render(T, KINECT, FURNITURE), k)) for k, T in enumerate(turn(n))]))
+def corner(n: int = 14) -> CoarseImages:
+    return coded([icp.coarsen(noisy(render(T, KINECT, FURNITURE), k)) for k, T in enumerate(turn(n))])
 
 
 def blind(n: int) -> tuple[Features, Words, Matches]:
@@ -46,13 +47,13 @@ def blind(n: int) -> tuple[Features, Words, Matches]:
     return features, words, Matches(pair, np.zeros(n, np.int64), np.zeros((0, 2), np.int32))
 
 
-def track(depth: CoarseDepth, **settings) -> Tracker:
-    features, words, matches = blind(len(depth.coarse_depth))
+def track(depth: CoarseImages, **settings) -> Tracker:
+    features, words, matches = blind(len(depth))
     frame_points = FramePoints(depth, KINECT, SENSOR)
     tracker = Tracker(
         features, words, matches, KINECT, TrackConfig(**settings), SENSOR, np.random.default_rng(0), frame_points=frame_points
     )
-    for i in range(len(depth.coarse_depth)):
+    for i in range(len(depth)):
         tracker.process(i)
     return tracker
 
@@ -90,18 +91,18 @@ def test_same_input_same_bytes():
 
 def test_a_flat_wall_begins_no_map_and_its_reason_is_given():
     T = [look_along([0.5 + 0.02 * k, 0.05 * k, 0.0], 0.0, 0.0) for k in range(4)]
-    depth = CoarseDepth(np.stack([icp.coarsen(noisy(render(t, KINECT, WALL, None), k)) for k, t in enumerate(T)]))
+    depth = coded([icp.coarsen(noisy(render(t, KINECT, WALL, None), k)) for k, t in enumerate(T)])
     tracker = track(depth)
     assert (tracker.tracks().state == LOST).all() and len(tracker.map().kf_frame) == 0
     assert "no map yet" in tracker.lost_reason[0]
 
 
 @cache
-def past_a_box(n: int = 16) -> tuple[CoarseDepth, np.ndarray]:
+def past_a_box(n: int = 16) -> tuple[CoarseImages, np.ndarray]:
     """Drive along a wall and a floor, past a box that is soon behind."""
     scene = (*WALL, ((-20.0, -20.0, -1.2), (20.0, 20.0, -1.0)), ((2.5, 0.8, -1.0), (3.0, 1.2, 0.3)))
     T = np.array([look_along([0.8, -0.07 * k, 0.0], 0.0, 0.3) for k in range(n)])
-    return CoarseDepth(np.stack([icp.coarsen(noisy(render(t, KINECT, scene, None), k)) for k, t in enumerate(T)])), T
+    return coded([icp.coarsen(noisy(render(t, KINECT, scene, None), k)) for k, t in enumerate(T)]), T
 
 
 @pytest.mark.parametrize("hold", [0.0, 0.2, 1.0])
@@ -121,18 +122,18 @@ def test_along_a_flat_wall_the_motion_goes_on_for_a_while(hold):
 
 def test_another_place_is_not_taken_for_the_one_before():
     wall = [icp.coarsen(noisy(render(look_along([0.5, 0.0, 0.0], 0.0, 0.0), KINECT, WALL, None), 40 + k)) for k in range(4)]
-    tracker = track(CoarseDepth(np.concatenate([corner().coarse_depth[:4], np.stack(wall)])))
+    tracker = track(coded([*corner().of(range(4)), *wall]))
     state = tracker.tracks().state
     assert (state[:4] != LOST).all() and (state[4:] == LOST).all()
     assert tracker.map().kf_segment.max() == 0
 
 
 def test_frames_without_depth_are_lost_and_found_again():
-    depth = corner().coarse_depth.copy()
+    depth = corner().of(range(14))
     depth[5:7] = 0
-    tracks = track(CoarseDepth(depth)).tracks()
+    tracks = track(coded(depth)).tracks()
     np.testing.assert_array_equal(np.flatnonzero(tracks.state == LOST), [5, 6])
-    assert ape(frame_poses(tracks, track(CoarseDepth(depth)).map()), turn(14)) < 0.01
+    assert ape(frame_poses(tracks, track(coded(depth)).map()), turn(14)) < 0.01
 
 
 def test_key_frames_are_joined_only_where_they_show_the_same():
@@ -194,7 +195,7 @@ def test_a_second_look_joins_key_frames_that_see_the_same_and_moves_them_to_wher
         state=np.full(n, KEY_FRAME, np.uint8),
         n_inliers=np.full(n, 60, np.int32),
     )
-    frame_points = FramePoints(CoarseDepth(corner().coarse_depth[frames]), KINECT, SENSOR)
+    frame_points = FramePoints(coded(corner().of(frames)), KINECT, SENSOR)
     sensing = Sensing(KINECT, Timing(np.array(0.0), np.array(0.0), np.array(0.0), np.zeros((n, 6))), {})
     look = {"frame_points": frame_points, "iterations": 20, "progress": lambda items, *_: items}
     after, result = final_refinement.refine_all(sparse_map, tracks, sensing, SENSOR, TrackConfig(), depth_icp_edges=most, **look)
@@ -210,7 +211,7 @@ def test_a_second_look_joins_key_frames_that_see_the_same_and_moves_them_to_wher
 
 def test_key_frames_are_joined_the_same_with_any_number_of_threads():
     frames, found = [0, 2, 4, 6], []
-    frame_points = FramePoints(CoarseDepth(corner().coarse_depth[frames]), KINECT, SENSOR)
+    frame_points = FramePoints(coded(corner().of(frames)), KINECT, SENSOR)
     for workers in (1, 3):
         sparse_map = revisit(frames)
         assert (

@@ -6,12 +6,13 @@ from functools import cache
 import numpy as np
 import pytest
 from boxroom import FURNITURE, KINECT, look_along, render
+from kinect import coded
 from scipy import ndimage
 
 from slamcli.config.options import SensorConfig
 from slamcli.depth import icp
 from slamcli.geometry import se3
-from slamcli.schema import CoarseDepth, Features, Words
+from slamcli.schema import Features, Words
 from slamcli.slam import background_motion_kernels, moving_object_kernels, moving_objects
 from slamcli.slam.background_motion import BackgroundMotion, anchor_frames
 from slamcli.slam.moving_objects import STEP, Views
@@ -41,7 +42,7 @@ def recording(who: str) -> tuple[Views, np.ndarray]:
         depth.append(icp.coarsen(seen))
         masks.append((seen < empty - 1e-3)[STEP // 2 :: STEP, STEP // 2 :: STEP])
     T_wc = np.array([camera_at(0 if who == "leaving" else i) for i in range(FRAMES)])
-    return Views(np.array(depth), np.arange(FRAMES) / RATE, T_wc, np.zeros(FRAMES, dtype=np.int64), KINECT), np.array(masks)
+    return Views(coded(depth), np.arange(FRAMES) / RATE, T_wc, np.zeros(FRAMES, dtype=np.int64), KINECT), np.array(masks)
 
 
 def test_a_walker_is_found_and_next_to_nothing_else() -> None:
@@ -97,8 +98,8 @@ def test_hiding_takes_away_what_is_marked_and_no_more() -> None:
     hidden = moving_objects.hide_features(features, moving, KINECT)
     assert np.isnan(hidden.depth).tolist() == [True, False, False] and (hidden.xy[0] < -1000).all()
     np.testing.assert_array_equal(hidden.xy[1:], xy[1:])
-    coarse = moving_objects.hide_coarse(CoarseDepth(views.depth), moving, KINECT).coarse_depth
-    changed = coarse != views.depth
+    coarse = moving_objects.hide_coarse(views.depth, moving, KINECT).of(range(FRAMES))
+    changed = coarse != views.depth.of(range(FRAMES))
     assert (coarse[3, 42:58, 62:78] == 0).all() and changed[3].sum() <= 24 * 24 and not changed[:3].any() and not changed[4:].any()
     pixels = moving_objects.hide_pixels(np.ones((120, 160), np.float32), moving[3], KINECT)
     assert np.isnan(pixels[42:58, 62:78]).all() and np.isfinite(pixels[:36]).all()
