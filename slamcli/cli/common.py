@@ -1,6 +1,7 @@
 """Options that several commands share."""
 
 import functools
+import json
 import math
 import os
 from collections.abc import Callable
@@ -132,6 +133,14 @@ def verbose_option(function: Function) -> Function:
     quiet = click.option("--quiet", is_flag=True, expose_value=False, callback=_voice, help="Show nothing but warnings and errors.")
     verbose = click.option("-v", "--verbose", count=True, expose_value=False, callback=_voice, help="Show more; -vv shows everything.")
     return quiet(verbose(function))
+
+
+def tell_written(out: Path, as_json: bool, text: str, **figures: Any) -> None:
+    """Say on stderr what was written, or print it on stdout as JSON: `out` and the figures."""
+    if as_json:
+        click.echo(json.dumps({"out": str(out), **figures}))
+    else:
+        click.echo(f"{out}: {text}", err=True)
 
 
 def check_ending(out: Path, *endings: str) -> str:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from slamcli.cli.common import Target, check_ending, json_option, mount_option, run_option
+from slamcli.cli.common import Target, check_ending, json_option, mount_option, run_option, tell_written
 from slamcli.formats import TRAJECTORY_FORMATS
 
 if TYPE_CHECKING:
@@ -65,7 +64,8 @@ def export_trajectory(
     ending = check_ending(out, *LAYOUT_OF, ".g2o")
     folder = RunDir.find(run)
     if ending == ".g2o":
-        _export_graph(out, folder, is_plain=(stage or "loop") == "loop" and frame == "world" and mount is None and layout is None)
+        is_plain = (stage or "loop") == "loop" and frame == "world" and mount is None and layout is None
+        _export_graph(out, folder, is_plain=is_plain, as_json=as_json)
         return
     layout = layout or LAYOUT_OF[ending]
     trajectory = trajectory_error.stage_trajectory(folder, stage or trajectory_error.last_stage(folder))
@@ -80,19 +80,12 @@ def export_trajectory(
     if mount is not None:
         T_wc = T_wc @ base_in_camera(mount)
     trajectory_file.writer(layout)(out, Trajectory(stamp=trajectory.stamp, T_wc=T_wc))
-    n_frames = trajectory_error.frame_count(folder)
-    if as_json:
-        click.echo(json.dumps({"out": str(out), "poses": len(trajectory.stamp), "frames": n_frames, "frame": frame, "format": layout}))
-        return
-    note = (
-        "; a KITTI file has no stamps, so its lines are not frame numbers here"
-        if layout == "kitti" and len(trajectory.stamp) < n_frames
-        else ""
-    )
-    click.echo(f"{out}: {len(trajectory.stamp)} poses of {n_frames} frames{note}", err=True)
+    n, n_frames = len(trajectory.stamp), trajectory_error.frame_count(folder)
+    note = "; a KITTI file has no stamps, so its lines are not frame numbers here" if layout == "kitti" and n < n_frames else ""
+    tell_written(out, as_json, f"{n} poses of {n_frames} frames{note}", poses=n, frames=n_frames, frame=frame, format=layout)
 
 
-def _export_graph(out: Path, folder: RunDir, *, is_plain: bool) -> None:
+def _export_graph(out: Path, folder: RunDir, *, is_plain: bool, as_json: bool) -> None:
     from slamcli.errors import SlamError
     from slamcli.files import write_bytes
 
@@ -102,7 +95,7 @@ def _export_graph(out: Path, folder: RunDir, *, is_plain: bool) -> None:
         )
     source = folder.stage_path("loop", "posegraph.g2o")
     write_bytes(out, source.read_bytes())
-    click.echo(f"{out}: {out.stat().st_size} bytes", err=True)
+    tell_written(out, as_json, f"{out.stat().st_size} bytes", bytes=out.stat().st_size, frame="world", format="g2o")
 
 
 out_folder = click.argument("out", type=click.Path(path_type=Path, file_okay=False))
@@ -122,7 +115,8 @@ images_option = click.option("--images", type=click.Choice(["png", "jpg"]), defa
 @frames_option
 @images_option
 @click.option("--text", "as_text", is_flag=True, help="Write the model as text instead of binary.")
-def export_colmap(out: Path, run: str | None, frames: str, images: str, as_text: bool) -> None:
+@json_option
+def export_colmap(out: Path, run: str | None, frames: str, images: str, as_text: bool, as_json: bool) -> None:
     """Write a COLMAP model into the new folder OUT: images/ and sparse/0/, in the level frame (z up, metres).
 
     It holds the landmarks with their tracks. Images are as recorded, with the lens in the camera's parameters; for programs that need
@@ -146,8 +140,10 @@ def export_colmap(out: Path, run: str | None, frames: str, images: str, as_text:
     _write_pictures(out / "images", folder, posed, names, colours.look)
     model = colours.model()
     (colmap.write_text if as_text else colmap.write_binary)(out / "sparse" / "0", model)
-    error = f", mean reprojection error {float(model.error.mean()):.2f} px" if len(model.error) else ""
-    click.echo(f"{out}: {len(names)} images, {len(model.xyz)} points{error}", err=True)
+    error = float(model.error.mean()) if len(model.error) else None
+    told = "" if error is None else f", mean reprojection error {error:.2f} px"
+    figures = {"images": len(names), "points": len(model.xyz), "reprojection_error_px": None if error is None else round(error, 4)}
+    tell_written(out, as_json, f"{len(names)} images, {len(model.xyz)} points{told}", frame="level", **figures)
 
 
 @click.command("export-nerfstudio")
@@ -155,7 +151,8 @@ def export_colmap(out: Path, run: str | None, frames: str, images: str, as_text:
 @run_option
 @frames_option
 @images_option
-def export_nerfstudio(out: Path, run: str | None, frames: str, images: str) -> None:
+@json_option
+def export_nerfstudio(out: Path, run: str | None, frames: str, images: str, as_json: bool) -> None:
     """Write transforms.json, images, depth and the cloud into the new folder OUT, for nerfstudio and Gaussian splatting.
 
     Poses are in the level frame (z up, metres); depth is in millimetres; splatting starts from the cloud, sparse_pc.ply.
@@ -180,7 +177,9 @@ def export_nerfstudio(out: Path, run: str | None, frames: str, images: str) -> N
     xyz, rgb, _ = cloud.read_ply(folder.stage_path("densify", "cloud.ply"))
     cloud.write_ply(out / CLOUD, xyz, rgb)
     nerfstudio.write_transforms(out / "transforms.json", camera, posed.T_lc, image=names, depth=depth, cloud=CLOUD)
-    click.echo(f"{out}: {len(names)} images, {sum(map(bool, depth))} with depth, {len(xyz)} points", err=True)
+    n, n_depth = len(names), sum(map(bool, depth))
+    told = f"{n} images, {n_depth} with depth, {len(xyz)} points"
+    tell_written(out, as_json, told, images=n, with_depth=n_depth, points=len(xyz), frame="level")
 
 
 def _check_new(out: Path) -> None:

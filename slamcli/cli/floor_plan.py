@@ -36,7 +36,7 @@ def export_plan(out: Path, run: str | None, wall_height: float, door_width: floa
     plan = api.Run(RunDir.find(run)).floor_plan(wall_height=wall_height, door_width=door_width)
     WRITERS[ending](out, plan.to_dict())
     if as_json:
-        click.echo(json.dumps(plan.to_dict(), indent=1))
+        click.echo(json.dumps({"out": str(out), **plan.to_dict()}, indent=1))
     _tell(out, plan, wall_height)
 
 

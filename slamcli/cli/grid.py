@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -97,9 +98,8 @@ def export_grid(
     rows, columns = grid.state.shape
     if as_json:
         about = {"out": [str(path) for path in written], "columns": columns, "rows": rows, "resolution": float(grid.resolution)}
-        click.echo(
-            json.dumps(about | {"origin": np.round(grid.origin, 9).tolist(), "start": dict(zip(("x", "y", "yaw"), start, strict=True))})
-        )
+        place = {name: round(value, 9) + 0.0 for name, value in zip(("x", "y", "yaw"), start, strict=True)}
+        click.echo(json.dumps(about | {"origin": np.round(grid.origin, 9).tolist(), "start": place}))
         return
     click.echo(f"{', '.join(str(path) for path in written)}: {columns} x {rows} cells of {float(grid.resolution):g} m", err=True)
 
@@ -238,7 +238,7 @@ def _tell_reachable(
         seen = Grid(grid.p_occupied, grid.n_seen, state, grid.origin, grid.resolution)
         save_picture(png, seen, title=f"white: within reach of a robot of {radius:g} m radius")
     if as_json:
-        click.echo(json.dumps({"start": list(start), "radius": radius, **found.to_dict()}))
+        click.echo(json.dumps({"start": _rounded(start), "radius": radius, **found.to_dict()}))
         return
     drawn = f"; drawn in {png}" if png else ""
     click.echo(f"{found.reached_area:.1f} of {found.free_area:.1f} m2 of free floor are within reach{drawn}")
@@ -290,11 +290,15 @@ def _csv(route: Route) -> str:
 
 def _json(route: Route, start: tuple[float, float], goal: tuple[float, float], radius: float) -> str:
     about = {
-        "frame": "level", "start": start, "goal": goal, "radius": radius, "length": round(route.length, 4),
-        "points": [[round(float(v), 4) for v in xy] for xy in route.xy],
+        "frame": "level", "start": _rounded(start), "goal": _rounded(goal), "radius": radius, "length": round(route.length, 4),
+        "points": [_rounded(xy) for xy in route.xy],
         "clearance": [round(float(v), 4) if v < 1e9 else None for v in route.clearance],
     }  # fmt: skip
     return json.dumps(about) + "\n"
+
+
+def _rounded(xy: Sequence[float] | np.ndarray) -> list[float]:
+    return [round(float(value), 4) + 0.0 for value in xy]
 
 
 def _write(out: Path, texts: dict[str, str]) -> None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from slamcli.cli.common import Target, check_ending, run_option
+from slamcli.cli.common import Target, check_ending, json_option, run_option, tell_written
 from slamcli.errors import SlamError
 
 if TYPE_CHECKING:
@@ -22,7 +22,8 @@ out_argument = click.argument("out", type=Target())
 @out_argument
 @run_option
 @click.option("--frame", type=click.Choice(["level", "world"]), default="level", show_default=True, help="level: z up, floor at z = 0.")
-def export_cloud(out: Path, run: str | None, frame: str) -> None:
+@json_option
+def export_cloud(out: Path, run: str | None, frame: str, as_json: bool) -> None:
     """Write the coloured cloud to OUT: .ply and .pcd with normals, .las, .laz and .e57 for surveyors' programs.
 
     \b
@@ -43,14 +44,15 @@ def export_cloud(out: Path, run: str | None, frame: str) -> None:
         xyz = se3.transform(T_wl, xyz)
         normal = None if normal is None else normal @ T_wl[:3, :3].T
     cloud.write(out, xyz, rgb, normal)
-    click.echo(f"{out}: {len(xyz)} points", err=True)
+    tell_written(out, as_json, f"{len(xyz)} points", points=len(xyz), frame=frame, bytes=out.stat().st_size)
 
 
 @click.command("export-octree")
 @out_argument
 @run_option
 @click.option("--colour", is_flag=True, help="Give occupied leaves the cloud's colours: a ColorOcTree (only .ot).")
-def export_octree(out: Path, run: str | None, colour: bool) -> None:
+@json_option
+def export_octree(out: Path, run: str | None, colour: bool, as_json: bool) -> None:
     """Write the octree to OUT for OctoMap and octovis: .bt (free or occupied, small) or .ot (with probabilities).
 
     \b
@@ -68,7 +70,7 @@ def export_octree(out: Path, run: str | None, colour: bool) -> None:
     else:
         with open(folder.stage_path("octree", f"map{suffix}"), "rb") as made, files.whole(out) as file:
             shutil.copyfileobj(made, file)
-    click.echo(f"{out}: {out.stat().st_size} bytes", err=True)
+    tell_written(out, as_json, f"{out.stat().st_size} bytes", bytes=out.stat().st_size, frame="level")
 
 
 def _export_colour_octree(out: Path, folder: RunDir) -> None:
@@ -90,7 +92,10 @@ def _export_colour_octree(out: Path, folder: RunDir) -> None:
 @click.option(
     "--even-colours/--raw-colours", default=None, help="Even out exposure and white balance. [default: the run's densify.even_colours]"
 )
-def export_mesh(out: Path, run: str | None, voxel: float, min_area: float, triangles: int | None, even_colours: bool | None) -> None:
+@json_option
+def export_mesh(
+    out: Path, run: str | None, voxel: float, min_area: float, triangles: int | None, even_colours: bool | None, as_json: bool
+) -> None:
     """Make a coloured triangle mesh of the key frames' depth and write it to OUT: .glb, .obj or .ply.
 
     It is in the level frame (z up, metres); a .glb file has y up, as its standard asks.
@@ -111,7 +116,8 @@ def export_mesh(out: Path, run: str | None, voxel: float, min_area: float, trian
     if not len(mesh.triangle):
         raise SlamError("the mesh is empty: no key frame has depth within densify.depth_max, or every part is smaller than --min-area")
     WRITERS[suffix](out, mesh.xyz, mesh.triangle, mesh.rgb, mesh.normal)
-    click.echo(f"{out}: {len(mesh.triangle)} triangles", err=True)
+    n, size = len(mesh.triangle), out.stat().st_size
+    tell_written(out, as_json, f"{n} triangles", triangles=n, vertices=len(mesh.xyz), frame="level", bytes=size)
 
 
 def _mesh(folder: RunDir, voxel: float, even_colours: bool | None) -> Mesh:

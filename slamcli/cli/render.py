@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from slamcli.cli.common import Target, check_ending, run_option
+from slamcli.cli.common import Target, check_ending, json_option, run_option, tell_written
 from slamcli.errors import SlamError
 
 if TYPE_CHECKING:
@@ -39,9 +39,10 @@ INSIDE_FIELD_OF_VIEW = 75.0  # [degrees] of films along the way: from inside a r
 @click.option("--below", type=float, default=1.8, show_default=True, help="Height at which a plan cuts the room open [m].")
 @click.option("--tour", type=click.Choice(["around", "along"]), default="around", show_default=True, help="The way of a film's camera.")
 @click.option("--seconds", type=click.FloatRange(0.1, 600), default=12.0, show_default=True, help="Length of a film [s].")
+@json_option
 def render_command(
     out: Path, run: str | None, what: str, azimuth: float, elevation: float, size: tuple[int, int], with_path: bool, below: float,
-    tour: str, seconds: float,
+    tour: str, seconds: float, as_json: bool,
 ) -> None:  # fmt: skip
     """Draw the cloud, the octree or a plan to OUT (.png, .jpg), or film the cloud (.mp4). Needs no display.
 
@@ -62,7 +63,10 @@ def render_command(
     if ending == FILM:
         if what != "cloud":
             raise SlamError(f"{out}: only the cloud is filmed; leave out --what {what}, or draw a picture")
-        _film(out, folder, tour, render.View(azimuth, elevation, *_even(size)), seconds, path)
+        view = render.View(azimuth, elevation, *_even(size))
+        n = _film(out, folder, tour, view, seconds, path)
+        told = f"{n} frames of {view.width} x {view.height} px"
+        tell_written(out, as_json, told, what=what, frames=n, width=view.width, height=view.height)
         return
     if what == "plan":
         image = _draw_plan(folder, below, size, path)
@@ -70,6 +74,8 @@ def render_command(
         view = render.View(azimuth_deg=azimuth, elevation_deg=elevation, width=size[0], height=size[1])
         image = (_draw_cloud if what == "cloud" else _draw_octree)(folder, view, path)
     _write_picture(out, ending, image)
+    height, width = image.shape[:2]
+    tell_written(out, as_json, f"{width} x {height} px", what=what, width=width, height=height)
 
 
 def _write_picture(out: Path, ending: str, image: np.ndarray) -> None:
@@ -81,7 +87,6 @@ def _write_picture(out: Path, ending: str, image: np.ndarray) -> None:
     if not done:
         raise SlamError(f"{out}: the picture cannot be encoded")
     files.write_bytes(out, data.tobytes())
-    click.echo(f"{out}: {image.shape[1]} x {image.shape[0]} px", err=True)
 
 
 def _draw_cloud(folder: RunDir, view: View, path: np.ndarray | None) -> np.ndarray:
@@ -111,7 +116,8 @@ def _draw_plan(folder: RunDir, below: float, size: tuple[int, int], path: np.nda
     return image
 
 
-def _film(out: Path, folder: RunDir, tour: str, view: View, seconds: float, path: np.ndarray | None) -> None:
+def _film(out: Path, folder: RunDir, tour: str, view: View, seconds: float, path: np.ndarray | None) -> int:
+    """Write a film; returns the number of its pictures."""
     from dataclasses import replace
 
     from slamcli import console
@@ -131,7 +137,7 @@ def _film(out: Path, folder: RunDir, tour: str, view: View, seconds: float, path
             yield render.draw_cloud(xyz, rgb, normal, spacing=folder.config().densify.voxel, view=eye, path=path)
 
     video.write_video(out, pictures())
-    click.echo(f"{out}: {n} frames of {view.width} x {view.height} px", err=True)
+    return n
 
 
 def _even(size: tuple[int, int]) -> tuple[int, int]:

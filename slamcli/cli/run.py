@@ -2,7 +2,6 @@
 
 import json
 import os
-from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -232,13 +231,13 @@ def config_command(
     has_run = run or os.environ.get("SLAMCLI_RUN") or LATEST.exists()
     base = RunDir.find(run).config() if has_run and not defaults else Config()
     config = toml.resolve(base, config_name, assignments)
-    if as_json:
-        click.echo(json.dumps(asdict(config), indent=1))
-        return
     only = toml.find_options(names) if explain else list(names)
     if changed:
         only = [name for name in toml.changed(config) if not only or name in only or name.partition(".")[0] in only]
-        if not only:
-            click.echo("# nothing differs from the defaults")
-            return
+    if as_json:
+        click.echo(json.dumps(toml.to_dict(config, only if names or changed else None), indent=1))
+        return
+    if changed and not only:
+        click.echo("# nothing differs from the defaults")
+        return
     click.echo(toml.dump(config, explain=explain, only=only, with_defaults=changed), nl=False)

@@ -268,9 +268,7 @@ def dump(config: Config, *, explain: bool = False, only: Sequence[str] = (), wit
     with_defaults : tell in a comment what the default is, where a value differs from it
     only : sections ("track") and options ("track.min_inliers") to write; all of them when empty
     """
-    for name in only:
-        if name not in known_keys() and name not in _sections() and name != "camera":
-            raise _unknown(name, "config")
+    _check_known(only)
     told = Told(explain=explain, with_defaults=with_defaults)
     blocks = [_block("", Config, config, told, only)]
     blocks += [_block(name, section, getattr(config, name), told, only) for name, section in _sections().items()]
@@ -278,6 +276,31 @@ def dump(config: Config, *, explain: bool = False, only: Sequence[str] = (), wit
         values = [f"{key} = {_toml(config.camera[key])}" for key in _camera_keys() if key in config.camera]
         blocks.append(["[camera]  # overrides the recording's calibration; keys: " + " ".join(_camera_keys()), *values])
     return "\n\n".join("\n".join(block) for block in blocks if block) + "\n"
+
+
+def to_dict(config: Config, only: Sequence[str] | None = None) -> dict[str, Any]:
+    """Return the values as plain ones, by section.
+
+    only : sections ("track") and options ("track.min_inliers") to return; all of them when None
+    """
+    values = dataclasses.asdict(config)
+    if only is None:
+        return values
+    _check_known(only)
+    chosen: dict[str, Any] = {}
+    for name in only:
+        section, _, key = name.partition(".")
+        if key:
+            chosen.setdefault(section, {})[key] = values[section].get(key)
+        else:
+            chosen[section] = values[section]
+    return chosen
+
+
+def _check_known(only: Sequence[str]) -> None:
+    for name in only:
+        if name not in known_keys() and name not in _sections() and name != "camera":
+            raise _unknown(name, "config")
 
 
 @dataclasses.dataclass(frozen=True)

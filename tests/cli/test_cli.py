@@ -389,6 +389,9 @@ def test_config_tells_what_is_changed_finds_by_word_and_speaks_json(fake: Path, 
     assert slamcli("config", "--changed", "loop").stdout == "# nothing differs from the defaults\n"
     assert "band_high" in slamcli("config", "--explain", "passable").stdout
     assert json.loads(slamcli("config", "--json").stdout)["track"]["min_inliers"] == 20
+    assert json.loads(slamcli("config", "--json", "--changed").stdout) == {"track": {"min_inliers": 20}}
+    assert json.loads(slamcli("config", "--json", "seed", "track.min_inliers").stdout) == {"seed": 0, "track": {"min_inliers": 20}}
+    assert slamcli("config", "--json", "trak").exit_code == 1
     unknown = slamcli("config", "--explain", "frobnicate")
     assert (unknown.exit_code, unknown.stdout) == (1, "")
 

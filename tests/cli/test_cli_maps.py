@@ -126,7 +126,7 @@ def test_a_floor_plan_is_written_and_told(slamcli: Callable, known: RunDir, tmp_
     result = slamcli("export-plan", tmp_path / "plan.json", "-r", known.path, "--wall-height", "9", "--json")
     assert result.exit_code == 0
     plan = json.loads((tmp_path / "plan.json").read_text())
-    assert plan == json.loads(result.stdout) and plan["walls"] == []
+    assert {"out": str(tmp_path / "plan.json"), **plan} == json.loads(result.stdout) and plan["walls"] == []
     assert f"0 walls, {len(plan['rooms'])} rooms" in result.stderr and "no wall was seen up to 9 m" in result.stderr
     assert slamcli("export-plan", tmp_path / "plan.png", "-r", known.path).exit_code == 1
 

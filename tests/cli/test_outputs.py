@@ -1,6 +1,8 @@
 """What commands write: whole or not at all, through links, and never into a run."""
 
+import json
 import os
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -48,6 +50,15 @@ def small_vocabulary(folder: Path) -> Path:
 def test_every_export_is_in_the_table() -> None:
     found = {name for name in cli.commands if name.startswith("export-")}
     assert found <= set(EXPORTS) | FOLDERS
+
+
+@pytest.mark.parametrize("command", sorted({*EXPORTS, *FOLDERS} - {"vocab export"}))
+def test_every_export_tells_programs_what_it_wrote(slamcli: Slamcli, room_run: Path, here: Path, command: str) -> None:
+    result = slamcli(command, here / EXPORTS.get(command, "folder"), "-r", room_run, *OPTIONS.get(command, []), "--json")
+    told = json.loads(result.stdout)  # one object and nothing else
+    written = told.pop("out")
+    assert result.exit_code == 0 and all(Path(one).exists() for one in ([written] if isinstance(written, str) else written))
+    assert len(told) >= 2 and not re.search(r"\de-\d", result.stdout), "numbers without tails"
 
 
 @pytest.mark.parametrize("command", EXPORTS)
