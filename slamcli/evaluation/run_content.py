@@ -13,7 +13,7 @@ from slamcli.evaluation.trajectory_error import Ape
 from slamcli.geometry import se3
 from slamcli.runs.run_directory import RunDir
 from slamcli.runs.staleness import State
-from slamcli.schema import LOST, Closures, Features, Ground, Map, Tracks, Trajectory
+from slamcli.schema import LOST, Closures, Doubt, Features, Ground, Map, Tracks, Trajectory
 
 UPRIGHT = np.array(
     [[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
@@ -32,6 +32,7 @@ class Content:
     state: np.ndarray  # (F,) as in Tracks
     n_inliers: np.ndarray  # (F,)
     n_features: np.ndarray  # (F,)
+    is_doubtful: np.ndarray  # (F,) whose pose the run itself doubts
     loops: np.ndarray  # (C, 2) frames
     ground: Ground | None
     ape: dict[str, Ape]  # by stage; empty without ground truth
@@ -81,6 +82,7 @@ def collect(run: RunDir) -> Content:
         state=np.array(tracks.state),
         n_inliers=np.array(tracks.n_inliers),
         n_features=np.diff(features.offset),
+        is_doubtful=np.array(run.load(Doubt, "loop").is_doubtful) if stage == "loop" else np.zeros(len(features.stamp), dtype=bool),
         loops=_loops(run, stage, map_),
         ground=ground,
         ape=ape,

@@ -49,7 +49,8 @@ def remarks(content: Content, inspected: Sequence[tuple[str, str]] = ()) -> list
 
 
 def _findings(content: Content) -> list[Remark]:
-    return [Remark(BAD if one.is_grave else NOTE, f"{one.text[:1].upper()}{one.text[1:]}.") for one in _doubts(content)]
+    texts = [(one.is_grave, one.text.replace("; slamcli report shows which", ", amber in the charts below")) for one in _doubts(content)]
+    return [Remark(BAD if is_grave else NOTE, f"{text[:1].upper()}{text[1:]}.") for is_grave, text in texts]
 
 
 def _doubts(content: Content) -> list[Finding]:
@@ -132,13 +133,12 @@ def _floor(content: Content) -> list[Remark]:
 
 
 def _stages(content: Content) -> list[Remark]:
-    found = []
-    unfit: dict[tuple[str, str], list[str]] = {}
+    found, unfit = [], []
     for stage, state in content.states.items():
         if state.state == MISSING:
             found.append(Remark(NOTE, f"{stage} has not been run; go on with: slamcli run {content.flag}"))
         elif not state.is_fresh:
-            unfit.setdefault((state.state, state.reason), []).append(stage)
+            unfit.append(state)
         warnings = [
             text
             for text in state.record.get("warnings", [])
@@ -148,9 +148,10 @@ def _stages(content: Content) -> list[Remark]:
         if len(warnings) > MOST_STAGE_WARNINGS:
             total = state.record.get("n_warnings", len(warnings))
             found.append(Remark(NOTE, f"{stage}: {total} warnings in all; they are in log.txt"))
-    for (state_name, reason), stages in unfit.items():
-        told = f"{', '.join(stages)} {'is' if len(stages) == 1 else 'are'} {state_name} ({reason})"
-        found.append(Remark(BAD, f"{told}; bring up to date with: slamcli run {content.flag}"))
+    if unfit:
+        told = f"{unfit[0].stage} is {unfit[0].state} ({unfit[0].reason})"
+        rest = f", and so {'is' if len(unfit) == 2 else 'are'} {', '.join(state.stage for state in unfit[1:])}" if len(unfit) > 1 else ""
+        found.append(Remark(BAD, f"{told}{rest}; bring up to date with: slamcli run {content.flag}"))
     return found
 
 

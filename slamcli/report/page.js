@@ -3,7 +3,8 @@
   const data = JSON.parse(document.getElementById("data").textContent);
   const n = data.time.length;
   const RAMP = [[59, 76, 192], [98, 160, 220], [120, 198, 121], [253, 191, 80], [200, 40, 40]];
-  const INK = "#1d2329", SOFT = "#5d6873", LINE = "#e3e7eb", BLUE = "#0072b2", LOST = "rgba(194,59,34,0.14)", LOOP = "#d55e00", KEY = "#17212b", START = "#00805e";
+  const INK = "#1d2329", SOFT = "#5d6873", LINE = "#e3e7eb", BLUE = "#0072b2", LOST = "rgba(194,59,34,0.14)", DOUBT = "rgba(230,159,0,0.3)", LOOP = "#d55e00", KEY = "#17212b", START = "#00805e";
+  const doubtful = new Set(data.doubtful);
   const hasPose = i => data.position[0][i] !== null;
   let cursor = -1;
   const listeners = [];
@@ -66,7 +67,7 @@
     for (let x = low[0]; x <= high[0] + 1e-9; x += step) line([at(x, low[1], floor), at(x, high[1], floor)], LINE, 1);
     for (let y = low[1]; y <= high[1] + 1e-9; y += step) line([at(low[0], y, floor), at(high[0], y, floor)], LINE, 1);
     context.fillStyle = SOFT; context.font = "11px sans-serif";
-    context.fillText("squares of " + step + " m" + (isOnFloor ? " on the floor" : ", " + floor.toFixed(2) + " m " + (data.hasFloor ? "above the floor" : "high")), 10, height - 9);
+    context.fillText("squares of " + step + " m" + (isOnFloor ? " on the floor" : ", " + floor.toFixed(2) + " m " + (data.hasFloor ? "above the floor" : "high")), 10, height - (width < 420 ? 52 : 9));
     const truth = data.truth[0].map((x, i) => at(x, data.truth[1][i], data.truth[2][i]));
     if (truth.length) line(truth, "#8a949e", 1.6, [5, 4]);
     context.setLineDash([]);
@@ -214,6 +215,8 @@
   addChart("features", data.features, "", 0, 1);
   if (!data.error.length) addChart("height of the camera", data.position[2], "m", 2, 1);
 
+  if (data.state.includes(0)) constant.push("red in the charts: lost");
+  if (doubtful.size) constant.push("amber in the charts: doubtful");
   document.getElementById("constant").textContent = constant.join("; ");
 
   const drawChart = chart => {
@@ -225,9 +228,9 @@
     const bottom = shown.reduce((a, b) => Math.min(a, b), 0), span = shown.reduce((a, b) => Math.max(a, b), bottom + 1e-9) - bottom, top = bottom + 1.08 * span;
     const y = v => TOP + h * (1 - (v - bottom) / (top - bottom));
     context.font = "11px sans-serif";
-    context.fillStyle = LOST;
     for (let i = 0; i < n; i++) {
-      if (data.state[i] !== 0) continue;
+      if (data.state[i] !== 0 && !doubtful.has(i)) continue;
+      context.fillStyle = data.state[i] === 0 ? LOST : DOUBT;
       const a = x(data.time[i]), b = i + 1 < n ? x(data.time[i + 1]) : a + 1;
       if (b >= LEFT && a <= width - RIGHT) context.fillRect(Math.max(a, LEFT), TOP, Math.max(Math.min(b, width - RIGHT) - Math.max(a, LEFT), 1), h);
     }
@@ -259,7 +262,7 @@
     if (cursor >= 0) {
       const cx = x(data.time[cursor]), v = chart.values[cursor];
       context.strokeStyle = INK; context.lineWidth = 1; context.beginPath(); context.moveTo(cx, TOP); context.lineTo(cx, TOP + h); context.stroke();
-      text += "   frame " + cursor + ", " + data.time[cursor].toFixed(2) + " s: " + (v === null ? (data.state[cursor] === 0 ? "lost" : "-") : (v * chart.factor).toFixed(chart.digits));
+      text += "   frame " + cursor + ", " + data.time[cursor].toFixed(2) + " s: " + (v === null ? (data.state[cursor] === 0 ? "lost" : "-") : (v * chart.factor).toFixed(chart.digits)) + (doubtful.has(cursor) ? ", doubtful" : "");
     }
     context.fillText(text, LEFT, 4);
   };

@@ -1,16 +1,14 @@
-"""The page itself: a template, a style sheet and a script, filled in. Every text from outside is escaped."""
+"""The page itself: what the template shows, as texts."""
 
-import html
 import json
 import platform
-import re
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
-from importlib import resources
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 
 from slamcli import __version__
 from slamcli.config.options import Config
@@ -18,36 +16,68 @@ from slamcli.console import counts
 from slamcli.evaluation.run_content import Content
 from slamcli.report import doubts
 from slamcli.report.pictures import Picture
+from slamcli.report.template import fill, resource, thousands
 
 MOST_TRUTH_POINTS = 6000
 
 
+@dataclass(frozen=True)
+class Card:
+    """One figure at the top of the page."""
+
+    name: str
+    value: str
+    is_amber: bool = False
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of texts."""
+
+    heading: list[str]
+    rows: list[list[str]]
+
+
+@dataclass(frozen=True)
+class Bar:
+    """A stage's share [%] of the time."""
+
+    share: str
+    title: str
+
+
+@dataclass(frozen=True)
+class Used:
+    """An option with the value that a stage ran with."""
+
+    name: str
+    value: str
+    is_changed: bool  # from the default
+
+
 def render(content: Content, pictures: list[Picture], inspected: Sequence[tuple[str, str]] = ()) -> str:
     """Fill the template; `inspected` are findings on the recording, as `report.make` takes them."""
-    parts = {
-        "title": html.escape(f"slamcli report: {content.name}"),
-        "name": html.escape(content.name),
-        "headline": html.escape(doubts.headline(content)),
-        "cards": _cards(content),
-        "remarks": _remarks(doubts.remarks(content, inspected)),
-        "errors": _errors(content),
-        "maps": "".join(_picture(picture) for picture in pictures)
-        or f"<p>No map has been made yet; go on with: slamcli run {html.escape(content.flag)}</p>",
-        "timings": _timings(content),
-        "recording": _pairs({"folder": content.recording["root"], **content.recording["camera"]}),
-        "configuration": _configuration(content),
-        "versions": _pairs(_versions(content)),
-        "made": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
-        "data": json.dumps(_data(content), separators=(",", ":"), allow_nan=False).replace("<", "\\u003c"),
-        "style": resource("page.css"),
-        "script": resource("page.js"),
-    }
-    return re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found.group(1)], resource("page.html"))
-
-
-def resource(name: str) -> str:
-    """Read a file of this package."""
-    return resources.files(__package__).joinpath(name).read_text(encoding="utf-8")
+    bars, timings = _timings(content)
+    data = json.dumps(_data(content), separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
+    return fill(
+        "page.html",
+        name=content.name,
+        flag=content.flag,
+        headline=doubts.headline(content),
+        cards=_cards(content),
+        remarks=doubts.remarks(content, inspected),
+        errors=_errors(content),
+        no_errors=content.no_truth or "Too few poses to compare with the ground truth.",
+        pictures=pictures,
+        bars=bars,
+        timings=timings,
+        recording=list({"folder": content.recording["root"], **content.recording["camera"]}.items()),
+        configuration=_configuration(content),
+        versions=list(_versions(content).items()),
+        made=datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
+        data=Markup(data),
+        script=Markup(resource("page.js")),
+    )
 
 
 def _data(content: Content) -> dict[str, Any]:
@@ -66,6 +96,7 @@ def _data(content: Content) -> dict[str, Any]:
         "state": content.state.tolist(),
         "inliers": content.n_inliers.tolist(),
         "features": content.n_features.tolist(),
+        "doubtful": np.flatnonzero(content.is_doubtful).tolist(),
         "error": _numbers(error, 6) if ape is not None else [],
         "truth": [_numbers(content.x_truth[::step, k], 4) for k in range(3)],
         "loops": content.loops.tolist(),
@@ -77,45 +108,31 @@ def _numbers(values: np.ndarray, digits: int) -> list[float | None]:
     return [round(float(value), digits) if np.isfinite(value) else None for value in values]
 
 
-def _cards(content: Content) -> str:
+def _cards(content: Content) -> list[Card]:
     n, n_poses = len(content.stamp), int(content.has_pose.sum())
     records = [state.record for state in content.states.values() if state.record]
     seconds = sum(record["seconds"] - record.get("compile_seconds", 0.0) for record in records)
+    ape, verdict = content.ape.get(content.stage), content.verdict
     cards = [
-        ("frames located", f"{n_poses} / {n}"),
-        ("key frames", content.summary("track").get("key_frames")),
-        ("loops closed", len(content.loops)),
+        Card("APE RMSE", f"{1000 * ape.rmse:.1f} mm") if ape else None,
+        Card("free floor", f"{verdict.evidence.free_area:.1f} m\u00b2", not verdict.is_usable) if verdict is not None else None,
+        Card("frames located", f"{n_poses} / {n}"),
+        _count("key frames", content.summary("track").get("key_frames")),
+        _count("loops closed", len(content.loops)),
+        _count("landmarks", content.summary(content.stage).get("landmarks")),
+        _count("cloud points", content.summary("densify").get("points")),
+        Card("time per frame", f"{1000 * seconds / n:.0f} ms"),
+        Card("peak memory", f"{max(record.get('peak_rss_mb', 0.0) for record in records):.0f} MiB"),
     ]
-    if content.ape.get(content.stage):
-        cards.insert(0, ("APE RMSE", f"{1000 * content.ape[content.stage].rmse:.1f} mm"))
-    if content.verdict is not None:
-        cards.insert(1, ("free floor", f"{content.verdict.evidence.free_area:.1f} m\u00b2"))
-    cards += [
-        ("landmarks", content.summary(content.stage).get("landmarks")),
-        ("cloud points", content.summary("densify").get("points")),
-        ("time per frame", f"{1000 * seconds / n:.0f} ms"),
-        ("peak memory", f"{max(record.get('peak_rss_mb', 0.0) for record in records):.0f} MiB"),
-    ]
-    is_amber = content.verdict is not None and not content.verdict.is_usable
-    return "".join(
-        f'<div class="card{" amber" if name == "free floor" and is_amber else ""}"><b>{html.escape(_thousands(value))}</b><span>{name}</span></div>'
-        for name, value in cards
-        if value is not None
-    )
+    return [card for card in cards if card is not None]
 
 
-def _thousands(value: Any) -> str:
-    return f"{value:,}".replace(",", "\u202f") if isinstance(value, int) else str(value)
+def _count(name: str, value: int | None) -> Card | None:
+    return None if value is None else Card(name, thousands(value))
 
 
-def _remarks(remarks: list[doubts.Remark]) -> str:
-    return "".join(f'<li class="{remark.kind}">{html.escape(remark.text)}</li>' for remark in remarks)
-
-
-def _errors(content: Content) -> str:
+def _errors(content: Content) -> Table | None:
     """Tabulate the error after each stage."""
-    if not content.ape:
-        return f"<p>{html.escape(content.no_truth or 'Too few poses to compare with the ground truth.')}</p>"
     rows = []
     for stage, ape in content.ape.items():
         figures = ape.to_dict()
@@ -123,44 +140,34 @@ def _errors(content: Content) -> str:
         cells += [f"{figures['n_poses']} / {figures['n_frames']}", f"{figures['scale']:.4f}", f"{figures['rmse_scaled']:.4f}"]
         rows.append([stage, *cells])
     heading = ["after", "RMSE [m]", "mean", "median", "std", "max", "poses", "scale", "RMSE scaled"]
-    note = (
-        "Absolute pose error after SE(3) alignment without scale, poses within 0.02 s of a true one; "
-        "the scale-fitted figures stand beside it."
-    )
-    return _table(heading, rows) + f'<p class="small">{note}</p>'
+    return Table(heading, rows) if rows else None
 
 
-def _timings(content: Content) -> str:
+def _timings(content: Content) -> tuple[list[Bar], Table]:
     """Tabulate what each stage cost; compiling kernels, which happens once on a machine, is kept apart."""
     records = {stage: state.record for stage, state in content.states.items() if state.record}
     compiling = {stage: record.get("compile_seconds", 0.0) for stage, record in records.items()}
     seconds = {stage: record["seconds"] - compiling[stage] for stage, record in records.items()}
     cpu = {stage: record.get("cpu_seconds", 0.0) - compiling[stage] for stage, record in records.items()}
     total, n = sum(seconds.values()) or 1.0, len(content.stamp)
-    rows, bars = [], []
-    for k, (stage, record) in enumerate(records.items()):
-        bars.append(f'<i style="width:{100 * seconds[stage] / total:.2f}%" class="c{k}" title="{stage}: {seconds[stage]:.1f} s"></i>')
+    bars = [Bar(f"{100 * seconds[stage] / total:.2f}", f"{stage}: {seconds[stage]:.1f} s") for stage in records]
+    rows = []
+    for stage, record in records.items():
         rate = f"{n / seconds[stage]:.1f}" if seconds[stage] > 0 else "-"
         cells = [f"{seconds[stage]:.2f}", f"{cpu[stage]:.2f}", f"{compiling[stage]:.2f}", rate, f"{record.get('peak_rss_mb', 0.0):.0f}"]
         rows.append([f"\u25a0 {stage}", content.states[stage].state, *cells, ", ".join(counts(record.get("summary", {})))])
     sums = [f"{total:.2f}", f"{sum(cpu.values()):.2f}", f"{sum(compiling.values()):.2f}", f"{n / total:.1f}"]
     rows.append(["total", "", *sums, "", f"{1000 * sum(cpu.values()) / n:.0f} ms CPU time a frame"])
-    heading = ["stage", "state", "seconds", "CPU seconds", "compiling", "frames/s", "peak MiB", "counts"]
-    return f'<div class="bar">{"".join(bars)}</div>' + _table(heading, rows, css="timings")
+    return bars, Table(["stage", "state", "seconds", "CPU seconds", "compiling", "frames/s", "peak MiB", "counts"], rows)
 
 
-def _configuration(content: Content) -> str:
-    """List the configuration each stage ran with; what differs from the default is marked."""
+def _configuration(content: Content) -> list[Used]:
+    """List the configuration each stage ran with."""
     defaults = _flat(json.loads(json.dumps(asdict(Config()))))
     used: dict[str, Any] = {}
     for state in content.states.values():
         used |= _flat(state.record.get("config", {}))
-    rows = []
-    for name, value in used.items():
-        is_changed = value != defaults.get(name)
-        text = html.escape(json.dumps(value)) + (" (changed)" if is_changed else "")
-        rows.append(f'<tr class="{"changed" if is_changed else ""}"><td>{html.escape(name)}</td><td>{text}</td></tr>')
-    return f"<table>{''.join(rows)}</table>"
+    return [Used(name, json.dumps(value), value != defaults.get(name)) for name, value in used.items()]
 
 
 def _flat(values: dict[str, Any]) -> dict[str, Any]:
@@ -185,20 +192,3 @@ def _by_version(stages: dict[str, list[str]]) -> str:
     if len(stages) == 1:
         return next(iter(stages))
     return "; ".join(f"{version} ({', '.join(made)})" for version, made in stages.items())
-
-
-def _picture(picture: Picture) -> str:
-    image = f'<img src="{picture.url}" alt="{html.escape(picture.title)}" tabindex="0">' if picture.url else ""
-    return f"<figure><h3>{html.escape(picture.title)}</h3>{image}<figcaption>{html.escape(picture.caption)}</figcaption></figure>"
-
-
-def _pairs(values: dict[str, Any]) -> str:
-    return _table([], [[name, value] for name, value in values.items()])
-
-
-def _table(heading: list[str], rows: list[list[Any]], css: str = "") -> str:
-    head = "".join(f"<th>{html.escape(cell)}</th>" for cell in heading)
-    body = "".join("<tr>" + "".join(f"<td>{html.escape(str(cell))}</td>" for cell in row) + "</tr>" for row in rows)
-    return (
-        f'<div class="scroll"><table class="{css}">{f"<thead><tr>{head}</tr></thead>" if head else ""}<tbody>{body}</tbody></table></div>'
-    )

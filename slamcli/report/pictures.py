@@ -12,6 +12,7 @@ from slamcli.evaluation.run_content import Content
 from slamcli.formats import cloud, octomap
 from slamcli.navigation import planner
 from slamcli.navigation.planner import Route
+from slamcli.report.template import thousands
 from slamcli.runs import placement
 from slamcli.runs.run_directory import RunDir
 from slamcli.schema import Features, Grid
@@ -65,7 +66,7 @@ def _cloud(run: RunDir, title: str, path: np.ndarray) -> Picture:
     rgb = rgb if rgb is not None else np.full((len(xyz), 3), 128, np.uint8)
     spacing = float(run.config().densify.voxel) * step**0.5
     image = render.draw_cloud(xyz[::step], rgb[::step], None if normal is None else normal[::step], spacing=spacing, view=VIEW, path=path)
-    return Picture(title, f"{len(xyz)} points, {file.stat().st_size / 1e6:.1f} MB; the camera's path in red", _jpeg(image))
+    return Picture(title, f"{thousands(len(xyz))} points, {file.stat().st_size / 1e6:.1f} MB; the camera's path in red", _jpeg(image))
 
 
 def _octree(run: RunDir, title: str, path: np.ndarray) -> Picture:
