@@ -118,6 +118,12 @@ def smooth(i: int) -> np.ndarray:
     return (7000 + 20 * np.arange(SIZE[0])[None] + 15 * np.arange(SIZE[1])[:, None] + i).astype(np.uint16)
 
 
+def far_away(i: int) -> np.ndarray:
+    """A wall 4 m off in a sensor's own steps: half of the neighbours are equal, and some are 256 units apart, which is 1 with bytes swapped."""
+    steps = np.tile([0, 0, 0, 0, 0, 256, 100, 100, 100, 100, 100], SIZE[0])[: SIZE[0]]
+    return np.tile(19000 + i + np.cumsum(steps), (SIZE[1], 1)).astype(np.uint16)
+
+
 def npy(array: np.ndarray) -> bytes:
     import io
 
@@ -232,6 +238,7 @@ CASES = {
     "32-bit whole numbers": Case(repaint(lambda i, raw: npy(raw.astype(np.int32)), suffix=".npy")),
     "an object in numpy's format": Case(repaint(lambda i, raw: npy(np.array([{}], dtype=object)), suffix=".npy"), said="no array of numbers", refused=True),
     "bytes swapped": Case(repaint(lambda i, raw: png(smooth(i).byteswap())), said="bytes of each reading are swapped", refused=True),
+    "large steps far away": Case(repaint(lambda i, raw: png(far_away(i))), holds=lambda s: np.nanmin(s.depth(0)) > 3.0),
     "8 bits": Case(repaint(lambda i, raw: png((raw >> 8).astype(np.uint8))), said="8 bits", refused=True),
     "8 bits stretched": Case(repaint(lambda i, raw: png(((smooth(i) >> 6) * 257).astype(np.uint16))), said="stretched to 16", refused=True),
     "three channels": Case(repaint(lambda i, raw: png(np.repeat((raw >> 8).astype(np.uint8)[..., None], 3, axis=2))), said="3 channels", refused=True),
