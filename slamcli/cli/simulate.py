@@ -28,6 +28,7 @@ import click
 )
 @click.option("--depth-min", default=0.4, show_default=True, help="Nearest reading of the noisy camera [m].")
 @click.option("--depth-max", default=5.0, show_default=True, help="Farthest reading of the noisy camera [m].")
+@click.option("--holes", default=0.0, show_default=True, help="Share of all surface that gives no depth, as glass does.")
 @click.option("--textured", default=1.0, show_default=True, help="Share of objects and walls with a picture; 0 = plain colours, shaded.")
 @click.option("--dark", is_flag=True, help="No lamp: the colour images hold noise only, the depth camera has its own light.")
 @click.option("--moved-object", "movable", is_flag=True, help="A parcel is taken away half-way.")
@@ -43,6 +44,7 @@ import click
     "--alias", type=click.Choice(["posters", "corridor"]), default=None, help="Places that look alike: opposite walls, equal doors."
 )
 @click.option("--room", type=(float, float), default=(8.0, 5.0), show_default=True, help="Sides of the room [m].")
+@click.option("--empty", is_flag=True, help="Nothing stands in the room.")
 @click.option("--trajectory", type=click.Path(path_type=Path), help="Follow a TUM trajectory instead; the room is made large enough.")
 @click.option("--stamps", type=click.Path(path_type=Path), help="Colour and depth stamps for --trajectory, two per line.")
 def simulate(out: Path, frames: int | None, speed: float | None, turn_rate: float | None, alias: str | None, **settings: Any) -> None:

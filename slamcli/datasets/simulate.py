@@ -50,6 +50,7 @@ class Simulation:
     noise: str = "kinect"  # or "none": exact images
     depth_min: float = 0.4  # of the noisy camera
     depth_max: float = 5.0
+    holes: float = 0.0  # share of all surface that gives no depth, as glass and black or shiny things do
     textured: float = 1.0  # share of objects and walls with a picture on them
     dark: bool = False  # nothing but noise in the colour images; depth brings its own light
     movable: bool = False  # a parcel that is gone in the second half
@@ -57,6 +58,7 @@ class Simulation:
     activities: tuple[str, ...] = ()  # that they take up in turn; () = all there are
     alias: str = ""  # "posters": opposite walls are the same; "corridor": equal doors
     room: tuple[float, float] = (8.0, 5.0)
+    empty: bool = False  # nothing stands in the room
     trajectory: Path | None = None  # TUM file to follow instead of driving rounds
     stamps: Path | None = None  # "colour depth" stamps for it
 
@@ -105,7 +107,9 @@ def build(what: Simulation) -> tuple[Scene, Motion]:
     if what.alias == "corridor":
         return room.corridor(low, high, seed=what.seed), motion
     centres = np.column_stack([path, np.zeros(len(path))])  # the robot itself is on the floor
-    return room.furnished_room(low, high, centres, seed=what.seed, twins=what.alias == "posters", movable=what.movable), motion
+    return room.furnished_room(
+        low, high, centres, seed=what.seed, twins=what.alias == "posters", movable=what.movable, empty=what.empty
+    ), motion
 
 
 def _around_trajectory(what: Simulation, trajectory: Path) -> tuple[Scene, Motion]:
@@ -123,7 +127,9 @@ def _around_trajectory(what: Simulation, trajectory: Path) -> tuple[Scene, Motio
         lacking = max(0.0, least - (high[axis] - low[axis])) / 2
         low[axis], high[axis] = low[axis] - lacking, high[axis] + lacking
     low[2], high[2] = 0.0, max(room.HEIGHT, float(centres[:, 2].max()) + 0.5)
-    return room.furnished_room(low, high, centres, seed=what.seed, twins=what.alias == "posters", movable=what.movable), motion
+    return room.furnished_room(
+        low, high, centres, seed=what.seed, twins=what.alias == "posters", movable=what.movable, empty=what.empty
+    ), motion
 
 
 def _read_stamps(path: Path) -> np.ndarray:
@@ -145,7 +151,7 @@ def _check(what: Simulation) -> None:
     bounds = {
         "frames": (1, 1_000_000), "laps": (0.01, 1000), "speed": (0.001, 100), "turn_rate": (0.001, 100), "rate": (0.1, 1000),
         "width": (32, 4096), "height": (32, 4096), "field_of_view": (20, 120), "camera_height": (0.1, 2.4), "pitch": (-80, 80),
-        "depth_min": (0, 10), "depth_max": (0.1, 13), "textured": (0, 1), "seed": (0, 2**31), "people": (0, MOST_PEOPLE),
+        "depth_min": (0, 10), "depth_max": (0.1, 13), "textured": (0, 1), "holes": (0, 1), "seed": (0, 2**31), "people": (0, MOST_PEOPLE),
     }  # fmt: skip
     for name, (least, most) in bounds.items():
         value = getattr(what, name)
@@ -201,7 +207,7 @@ def _write_images(
     n = len(motion.colour_stamp)
     has_one_clock = np.array_equal(motion.colour_stamp, motion.depth_stamp)
     sensor = replace(SensorNoise(), near=what.depth_min, far=what.depth_max)
-    normal_noise = noise.NormalNoise((what.height, what.width), what.seed)
+    normal_noise, camera = noise.NormalNoise((what.height, what.width), what.seed), what.camera()
 
     def one(i: int) -> None:
         rng = np.random.default_rng([what.seed, 3, i])
@@ -219,13 +225,16 @@ def _write_images(
                 depth, cosine = drawn.depth, drawn.cosine
         if what.dark:
             rgb = np.zeros_like(rgb)
+        lost = noise.without_reading(depth, motion.depth_T_lc[i], camera, share=what.holes, seed=what.seed) if what.holes else None
         if what.noise == "kinect":
-            depth = noise.depth_noise(depth, cosine, what.camera().fx, sensor, normal_noise, rng)
+            depth = noise.depth_noise(depth, cosine, camera.fx, sensor, normal_noise, rng)
             picture = noise.colour_noise(rgb, sensor, normal_noise, rng)
         else:
             picture = np.clip(rgb + 0.5, 0, 255).astype(np.uint8)
         units = np.round(depth.astype(np.float64) * DEPTH_SCALE)
         units[units > np.iinfo(np.uint16).max] = 0
+        if lost is not None:
+            units[lost] = 0
         _write_png(folder / "rgb" / f"{motion.colour_stamp[i]:.6f}.png", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
         _write_png(folder / "depth" / f"{motion.depth_stamp[i]:.6f}.png", units.astype(np.uint16))
 

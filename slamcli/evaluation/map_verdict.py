@@ -10,9 +10,9 @@ from slamcli.depth import icp
 from slamcli.evaluation import map_evidence
 from slamcli.evaluation.map_evidence import Evidence, View
 from slamcli.runs.run_directory import RunDir
-from slamcli.schema import Grid, Ground, Map, Tracks, frame_poses
+from slamcli.schema import Grid, Ground, Map, Moving, Tracks, frame_poses
 from slamcli.stages.depth_frames import depth_poses
-from slamcli.stages.moving_parts import coarse_images
+from slamcli.stages.moving_parts import still
 
 # A map with less free floor than this, or than the camera's path covers, or with fewer such views is of no use; the others tell why.
 LEAST_FREE = 2.0  # [m^2] of free floor: a robot of 0.2 m radius can hardly turn round on less
@@ -145,8 +145,8 @@ def of_run(run: RunDir) -> Verdict | None:
 
 
 def _views(run: RunDir, T_lw: np.ndarray) -> list[View]:
-    """Read frames spread over the recording, of those that have a pose and depth."""
-    images, sensor = coarse_images(run), run.config().sensor
+    """Read frames spread over the recording, of those that have a pose and depth, without what moves: it is seen in several places."""
+    (_, images), sensor = still(run, run.load(Moving, "loop")), run.config().sensor
     camera, given = run.camera("loop"), run.camera()
     poses = [(frame, T_lw @ T_wd) for frame, T_wd in depth_poses(run, frames="all") if images[frame].any()]
     rows = sorted({int(row) for row in np.linspace(0, len(poses) - 1, min(len(poses), map_evidence.MOST_VIEWS))})

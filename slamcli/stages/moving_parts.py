@@ -30,7 +30,7 @@ def coarse_images(inputs: Stored) -> CoarseImages:
     return CoarseImages(inputs.load(CoarseDepth, "extract"))
 
 
-def still(inputs: Inputs, moving: Moving) -> tuple[Features, CoarseImages]:
+def still(inputs: Stored, moving: Moving) -> tuple[Features, CoarseImages]:
     """Return the recording's features and coarse depth without what moves."""
     features, depth, camera = inputs.load(Features, "extract"), coarse_images(inputs), inputs.camera()
     return moving_objects.hide_features(features, moving.moving, camera), moving_objects.hide_coarse(depth, moving.moving, camera)

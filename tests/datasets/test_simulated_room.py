@@ -4,10 +4,13 @@ import json
 
 import numpy as np
 import pytest
+from boxroom import look_along, render
 
 from slamcli.datasets.simulate import Simulation, build
+from slamcli.datasets.simulated import noise
 from slamcli.datasets.simulated.scene import Scene, Solid, box, cylinder, with_textured_share
 from slamcli.datasets.simulated.texture import flat
+from slamcli.geometry import se3
 
 SEEDS = range(12)
 
@@ -85,6 +88,27 @@ def test_the_shell_is_closed_and_faces_inwards() -> None:
         normal = -np.cross(patch.a, patch.b)
         volume -= patch.origin @ normal / 3
     assert volume == pytest.approx(np.prod(scene.high - scene.low))
+
+
+def test_an_empty_room_holds_nothing() -> None:
+    full, empty = (build(Simulation(seed=1, empty=flag))[0] for flag in (False, True))
+    assert full.solids and not empty.solids and len(empty.shell) == len(full.shell)
+
+
+def test_surface_without_reading_is_the_same_in_every_view() -> None:
+    camera, T_lc = Simulation(width=160, height=120).camera(), np.array([look_along([1.0, 1.0, 1.0], yaw, 0.3) for yaw in (0.0, 0.3)])
+    depth = [render(T, camera) for T in T_lc]
+    lost = [noise.without_reading(z, T, camera, share=0.4, seed=3) for z, T in zip(depth, T_lc, strict=True)]
+    assert all(0.25 < one.mean() < 0.55 for one in lost)
+    xyz = np.concatenate([camera.rays.astype(float), np.ones((120, 160, 1))], axis=-1) * depth[0][..., None]
+    x_j = se3.transform(se3.inverse(T_lc[1]) @ T_lc[0], xyz.reshape(-1, 3))
+    column, row = np.rint(camera.project(x_j)).astype(int).T
+    inside = (x_j[:, 2] > 0.1) & (column >= 0) & (row >= 0) & (column < 160) & (row < 120)
+    is_seen = inside.copy()
+    is_seen[inside] = np.abs(depth[1][row[inside], column[inside]] - x_j[inside, 2]) < 0.02
+    agree = lost[0].ravel()[is_seen] == lost[1][row[is_seen], column[is_seen]]
+    assert is_seen.sum() > 5000 and agree.mean() > 0.93  # but at the edges of patches
+    assert not noise.without_reading(depth[0], T_lc[0], camera, share=0.0, seed=3).any()
 
 
 def test_twins_share_their_picture() -> None:

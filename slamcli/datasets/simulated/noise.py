@@ -5,6 +5,11 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from slamcli.geometry.camera import Camera
+
+PATCH = 0.4  # [m] side of a patch of surface that gives no reading
+HASH = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9, 0xD6E8FEB86659FD93], dtype=np.uint64)  # odd; spread bits
+
 
 @dataclass(frozen=True)
 class SensorNoise:
@@ -65,6 +70,20 @@ def depth_noise(
         | (cosine < noise.grazing * (1 + 0.3 * normal[0]))
     )
     return np.where(lost | (z < noise.near) | (z > noise.far), np.float32(0.0), z)
+
+
+def without_reading(depth: np.ndarray, T_lc: np.ndarray, camera: Camera, *, share: float, seed: int) -> np.ndarray:
+    """Find the pixels (H, W) that show glass, black or shiny surface, which gives no reading: patches fixed in space, `share` of all.
+
+    depth : (H, W) float32 [m], exact
+    """
+    x, y = camera.rays[..., 0] * depth, camera.rays[..., 1] * depth
+    xyz = np.stack([x, y, depth], axis=-1) @ T_lc[:3, :3].T.astype(np.float32) + T_lc[:3, 3].astype(np.float32)
+    # Moved by a part of a cell, as floor and walls lie at whole multiples.
+    cell = np.floor(xyz / np.float32(PATCH) + np.float32(0.37)).astype(np.int64).astype(np.uint64)
+    mixed = (cell * HASH[:3]).sum(axis=-1) + np.array([seed + 1], dtype=np.uint64) * HASH[3]
+    mixed = (mixed ^ (mixed >> np.uint64(29))) * HASH[3]
+    return (mixed >> np.uint64(40)).astype(np.float64) < share * 2.0**24
 
 
 def in_projector_shadow(depth: np.ndarray, focal_baseline: float) -> np.ndarray:

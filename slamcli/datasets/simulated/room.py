@@ -29,13 +29,16 @@ WALL_FRAMES = {
 }
 
 
-def furnished_room(low: np.ndarray, high: np.ndarray, path: np.ndarray, *, seed: int, twins: bool = False, movable: bool = False) -> Scene:
+def furnished_room(
+    low: np.ndarray, high: np.ndarray, path: np.ndarray, *, seed: int, twins: bool = False, movable: bool = False, empty: bool = False
+) -> Scene:
     """Furnish a room so that the camera's path never comes near an object.
 
     low, high : (3,) [m] corners of the room
     path : (N, 3) [m] camera centres
     twins : opposite walls look the same
     movable : put a large parcel beside the path, marked as movable
+    empty : put nothing into it
     """
     rng = np.random.default_rng([seed, 0])
     free = FreeSpace(low, high, path)
@@ -43,10 +46,11 @@ def furnished_room(low: np.ndarray, high: np.ndarray, path: np.ndarray, *, seed:
     for rect in doors:
         free.take(rect)
     solids: list[Solid] = []
-    _special_boxes(solids, free, rng, high[2], movable)
-    _island(solids, free, rng)
-    _along_walls(solids, free, rng)
-    _scatter(solids, free, rng)
+    if not empty:
+        _special_boxes(solids, free, rng, high[2], movable)
+        _island(solids, free, rng)
+        _along_walls(solids, free, rng)
+        _scatter(solids, free, rng)
     lamps = _lamps(low, high)
     base = pick(rng, (t.planks((196, 150, 100)), t.planks((150, 106, 72)), t.tiles((206, 198, 184)), t.planks((214, 186, 146))))
     floor = p.floor(base, _rugs(low, high, rng))
