@@ -199,14 +199,18 @@ def frame_poses(tracks: Tracks, map_: Map, segment: int = 0) -> np.ndarray:
     """Return T_wc (F, 4, 4) of every frame of a map segment under its key-frame poses, NaN for the lost and for those of other segments."""
     T_wc = np.full((len(tracks.ref_kf), 4, 4), np.nan)
     is_here = frame_segments(tracks, map_) == segment
-    T_wc[is_here] = map_.T_wk[tracks.ref_kf[is_here]] @ tracks.T_kc[is_here]
+    T_wc[is_here] = np.einsum(
+        "nij,njk->nik", map_.T_wk[tracks.ref_kf[is_here]], tracks.T_kc[is_here]
+    )  # not BLAS, whose digits follow the processor
     return T_wc
 
 
 def poses_in_segments(tracks: Tracks, map_: Map) -> tuple[np.ndarray, np.ndarray]:
     """Return the map segment (F,) of every frame, -1 where it is lost, and T_wc (F, 4, 4) in the world of that segment, NaN where lost."""
     T_wc, has_pose = np.full((len(tracks.ref_kf), 4, 4), np.nan), tracks.ref_kf >= 0
-    T_wc[has_pose] = map_.T_wk[tracks.ref_kf[has_pose]] @ tracks.T_kc[has_pose]
+    T_wc[has_pose] = np.einsum(
+        "nij,njk->nik", map_.T_wk[tracks.ref_kf[has_pose]], tracks.T_kc[has_pose]
+    )  # not BLAS, whose digits follow the processor
     return frame_segments(tracks, map_), T_wc
 
 

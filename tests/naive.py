@@ -2,6 +2,20 @@
 
 import numpy as np
 
+# --- geometry/algebra.py
+
+
+def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Matrix product with sums from the first index to the last, every operation rounded by itself."""
+    out = np.zeros((a.shape[0], b.shape[1]))
+    for i, j in np.ndindex(out.shape):
+        total = a[i, 0] * b[0, j]
+        for k in range(1, a.shape[1]):
+            total = total + a[i, k] * b[k, j]
+        out[i, j] = total
+    return out
+
+
 # --- geometry/voxel.py, geometry/octree.py, dense/occupancy.py, dense/voxel_cloud.py, depth/oriented_points.py
 
 

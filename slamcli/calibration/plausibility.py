@@ -15,6 +15,8 @@ from slamcli.calibration import self_calibration
 from slamcli.calibration.self_calibration import Sensing
 from slamcli.config.options import SensorConfig
 from slamcli.depth import noise_model
+from slamcli.geometry import elementary
+from slamcli.geometry.algebra import nearest_rotation, product
 from slamcli.geometry.camera import Camera
 from slamcli.sparse_map.sparse_map import SparseMap
 
@@ -96,7 +98,7 @@ def most_rigid(views: Iterable[tuple[Seen, Seen]], camera: Camera, sensor: Senso
         return None
     total = np.mean(costs, axis=0)
     best = int(np.argmin(total))
-    given = float(np.interp(0.0, np.log(FACTORS), total))
+    given = float(np.interp(0.0, elementary.log(FACTORS), total))
     return Rigidity(_summit(total, best), given / max(float(total[best]), 1e-9), len(costs))
 
 
@@ -127,7 +129,9 @@ def _misfit(a: Seen, b: Seen, camera: Camera, sensor: SensorConfig) -> np.ndarra
     if is_near.sum() < SHARED:
         return None
     x = [camera.backproject(seen.xy[is_near], seen.depth[is_near]) for seen in (a, b)]
-    sigma = np.hypot(*(noise_model.depth_sigma(p[:, 2], base=sensor.depth_noise_base, quadratic=sensor.depth_noise_quadratic) for p in x))
+    sigma = np.linalg.norm(
+        [noise_model.depth_sigma(p[:, 2], base=sensor.depth_noise_base, quadratic=sensor.depth_noise_quadratic) for p in x], axis=0
+    )
     stretch = np.stack([FACTORS, FACTORS, np.ones_like(FACTORS)], axis=1)[:, None]
     misfit = np.zeros((len(FACTORS), int(is_near.sum())))
     for _ in range(ROUNDS):  # false matches lose their weight
@@ -142,9 +146,8 @@ def _residuals(a: np.ndarray, b: np.ndarray, weight: np.ndarray) -> np.ndarray:
     """
     share = weight / weight.sum(axis=1, keepdims=True)
     a, b = (p - np.einsum("sn,sni->si", share, p)[:, None] for p in (a, b))
-    U, _, Vt = np.linalg.svd(np.einsum("sn,sni,snj->sij", share, a, b))
-    Vt[:, 2] *= np.sign(np.linalg.det(U @ Vt))[:, None]
-    return np.linalg.norm(b - np.einsum("sni,sij->snj", a, U @ Vt), axis=2)
+    R = nearest_rotation(np.einsum("sn,sni,snj->sij", share, a, b))
+    return np.linalg.norm(b - product(a, R), axis=2)
 
 
 def _summit(total: np.ndarray, best: int) -> float:

@@ -11,6 +11,7 @@ import numpy as np
 from numba import b1, f4, f8, i8
 
 from slamcli.geometry import se3
+from slamcli.geometry.algebra import product, solve
 from slamcli.geometry.camera import Camera
 from slamcli.jit.kernel import kernel
 from slamcli.schema import Features, Map, Timing, Tracks, frame_poses
@@ -39,12 +40,13 @@ def twists(stamp: np.ndarray, T_wc: np.ndarray) -> np.ndarray:
     use = inside & has_pose[j] & has_pose[:, None] & (np.abs(dt) <= MAX_GAP)
     here, there = np.nonzero(use)
     motion = np.zeros((n, len(steps), 6))
-    motion[here, there] = se3.log(se3.inverse(T_wc[here]) @ T_wc[j[here, there]])
-    powers = (dt[:, :, None] / MAX_GAP) ** np.arange(4) * use[:, :, None]
+    motion[here, there] = se3.log(product(se3.inverse(T_wc[here]), T_wc[j[here, there]]))
+    share = dt / MAX_GAP
+    powers = np.stack([np.ones_like(share), share, share * share, share * share * share], axis=2) * use[:, :, None]
     powers[~use.all(axis=1), :, 2:] = 0.0
     normal = np.einsum("nki,nkj->nij", powers, powers)
     normal += np.eye(4) * (np.einsum("nii->ni", normal) == 0.0)[:, None, :]
-    return np.linalg.solve(normal, np.einsum("nki,nkj->nij", powers, motion))[:, 1] / MAX_GAP
+    return solve(normal, np.einsum("nki,nkj->nij", powers, motion))[:, 1] / MAX_GAP
 
 
 def frame_twists(stamp: np.ndarray, tracks: Tracks, map_: Map) -> np.ndarray:

@@ -179,7 +179,7 @@ def _registration(
         T_cd = np.eye(4) if calibration.T_cd is None else calibration.T_cd
         if (camera.width, camera.height) != probe.size:
             camera = camera.scaled(*probe.size)
-        offset = 1000 * float(np.linalg.norm(T_cd[:3, 3]))
+        offset = 1000 * float(np.linalg.norm(T_cd[:3, 3], axis=-1))
         said = f"{found.root}: depth is registered to colour on reading (focal length {camera.fx:.1f} px, {offset:.0f} mm aside)"
         return Registration(camera, working, T_cd), [said]
     if abs(probe.size[0] / probe.size[1] / (whole.width / whole.height) - 1.0) > 2 * SHAPE_TOLERANCE:

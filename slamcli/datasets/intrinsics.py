@@ -10,6 +10,7 @@ import numpy as np
 
 from slamcli import files
 from slamcli.errors import SlamError
+from slamcli.geometry.algebra import product
 from slamcli.geometry.camera import EQUIDISTANT
 
 MAX_BYTES = 1 << 20
@@ -195,11 +196,14 @@ def _pose(depth: Mapping[str, Any], path: Path) -> np.ndarray | None:
     translation, rotation = _flat(depth.get("translation", T_cd[:3, 3])), _flat(depth.get("rotation", T_cd[:3, :3]))
     if len(translation) != 3 or len(rotation) not in (4, 9) or not np.isfinite([*translation, *rotation]).all():
         raise SlamError(wrong)
-    if len(rotation) == 4 and np.linalg.norm(rotation) > 1e-6:
+    if len(rotation) == 4 and np.linalg.norm(rotation, axis=-1) > 1e-6:
         T_cd = se3.from_quaternion(np.array([translation]), np.array([rotation]))[0]
     elif len(rotation) == 9:
         T_cd[:3, :3], T_cd[:3, 3] = np.array(rotation).reshape(3, 3), translation
-    if np.abs(T_cd[:3, :3] @ T_cd[:3, :3].T - np.eye(3)).max() > 1e-3 or np.linalg.det(T_cd[:3, :3]) < 0.9:
+    if (
+        np.abs(product(T_cd[:3, :3], T_cd[:3, :3].T) - np.eye(3)).max() > 1e-3
+        or not product(np.cross(T_cd[:3, 0], T_cd[:3, 1]), T_cd[:3, 2]) > 0.9
+    ):
         raise SlamError(f"{path}: the rotation of the depth camera is none")
     return T_cd
 

@@ -16,6 +16,7 @@ from slamcli.datasets.simulated.scene import Patch, Scene, with_textured_share
 from slamcli.datasets.staging import staged
 from slamcli.errors import SlamError
 from slamcli.formats.trajectory import read_tum, write_tum
+from slamcli.geometry.algebra import product
 from slamcli.geometry.camera import Camera
 from slamcli.parallel import ordered_map
 from slamcli.schema import Trajectory
@@ -118,7 +119,7 @@ def _around_trajectory(what: Simulation, trajectory: Path) -> tuple[Scene, Motio
     lift = max(0.0, 0.4 - float(followed.T_wc[:, 2, 3].min()))
     T_lw = np.eye(4)
     T_lw[2, 3] = lift
-    followed = Trajectory(stamp=followed.stamp, T_wc=T_lw @ followed.T_wc)
+    followed = Trajectory(stamp=followed.stamp, T_wc=product(T_lw, followed.T_wc))
     stamps = _read_stamps(what.stamps) if what.stamps is not None else None
     motion = drive.along(followed, stamps, rate=what.rate, frames=what.frames)
     centres = np.concatenate([motion.colour_T_lc[:, :3, 3], motion.depth_T_lc[:, :3, 3]])
@@ -244,7 +245,7 @@ def _write_images(
 
 
 def _texel(patches: list[Patch], width: int) -> float:
-    area = sum(np.linalg.norm(patch.a) * np.linalg.norm(patch.b) for patch in patches)
+    area = sum(np.linalg.norm(patch.a, axis=-1) * np.linalg.norm(patch.b, axis=-1) for patch in patches)
     return max(TEXEL_AT_640 * 640 / width, float(np.sqrt(area / MAX_TEXELS)))
 
 

@@ -10,12 +10,13 @@ import numpy as np
 from scipy import sparse
 
 from slamcli.depth.oriented_points import Surface
-from slamcli.geometry import se3, voxel
+from slamcli.geometry import elementary, se3, voxel
+from slamcli.geometry.algebra import solve
 
 SIDE = 0.03  # [m] of a voxel
 MOST_SAMPLES = 4000  # compared per frame
 DARKEST, BRIGHTEST = 12, 245  # grey levels: beyond them the sensor no longer tells how much light there was
-PRIOR = 1.0 / np.log(1.5)  # a gain differs from 1 by a half either way, as one sample's worth of evidence
+PRIOR = 1.0 / 0.4054651081081644  # 1 / log 1.5: a gain differs from 1 by a half either way, as one sample's worth of evidence
 NOISE = 0.1  # of a logarithm: texture within a voxel, shading
 ROUNDS = 6  # of re-weighting
 TUKEY = 4.685  # robust deviations at which a sample no longer counts, for 95 % efficiency
@@ -34,7 +35,7 @@ def frame_gains(frames: Iterable[tuple[Surface, np.ndarray, np.ndarray]]) -> np.
         return np.ones((n_frames, 3))
     of_frame = np.repeat(np.arange(n_frames), counts)
     of_voxel = np.unique(np.concatenate(key), return_inverse=True)[1]
-    return np.exp(fit_log_gains(of_frame, of_voxel, np.concatenate(log_colour), n_frames=n_frames))
+    return elementary.exp(fit_log_gains(of_frame, of_voxel, np.concatenate(log_colour), n_frames=n_frames))
 
 
 def _samples(frames: Iterable[tuple[Surface, np.ndarray, np.ndarray]]) -> tuple[list[np.ndarray], list[np.ndarray]]:
@@ -48,7 +49,7 @@ def _samples(frames: Iterable[tuple[Surface, np.ndarray, np.ndarray]]) -> tuple[
         cell = np.floor(xyz / SIDE).astype(np.int64) + HALF_EXTENT
         inside = ((cell >= 0) & (cell < 2 * HALF_EXTENT)).all(axis=1)
         cells, row = np.unique(voxel.morton(cell[inside]), return_inverse=True)
-        logs = np.log(colour[is_told][inside].astype(np.float64))
+        logs = elementary.log(colour[is_told][inside].astype(np.float64))
         total = np.column_stack([np.bincount(row, weights=logs[:, k], minlength=len(cells)) for k in range(3)])
         mean = total / np.maximum(np.bincount(row, minlength=len(cells)), 1)[:, None]
         step = max(1, -(-len(cells) // MOST_SAMPLES))
@@ -75,7 +76,7 @@ def fit_log_gains(of_frame: np.ndarray, of_voxel: np.ndarray, log_colour: np.nda
             A = np.diag(np.asarray(M.sum(axis=1)).ravel() + PRIOR**2) - (M @ sparse.diags(1.0 / per_voxel) @ M.T).toarray()
             mean = np.bincount(of_voxel, weights=weight * value, minlength=n_voxels) / per_voxel
             b = np.bincount(of_frame, weights=weight * (mean[of_voxel] - value), minlength=n_frames)
-            gain[:, channel] = np.linalg.solve(A, b)
+            gain[:, channel] = solve(A, b)
             evened = value + gain[of_frame, channel]
             middle = np.bincount(of_voxel, weights=weight * evened, minlength=n_voxels) / per_voxel
             residual = np.abs(evened - middle[of_voxel])

@@ -14,7 +14,7 @@ import numpy as np
 from numba import f4, i4, i8, u1, u8
 
 from slamcli.dense.ray_casting import OCCUPIED, mark_scan
-from slamcli.geometry import voxel
+from slamcli.geometry import elementary, voxel
 from slamcli.geometry.octree import CENTRE, DEPTH, Octree
 from slamcli.geometry.voxel import find_or_add, spread
 from slamcli.jit.kernel import kernel
@@ -33,7 +33,7 @@ class Scan(NamedTuple):
 
 def log_odds(probability: float) -> np.float32:
     """Return ln(p / (1 - p)); (12) of Zhao et al."""
-    return np.float32(np.log(probability / (1.0 - probability)))
+    return np.float32(elementary.log(probability / (1.0 - probability)))
 
 
 class OccupancyMap:

@@ -31,7 +31,7 @@ class Mesh:
     def moved(self, T_ab: np.ndarray) -> "Mesh":
         """Return the mesh of frame b in frame a."""
         xyz = se3.transform(T_ab, self.xyz.astype(np.float64)).astype(np.float32)
-        return Mesh(xyz, self.rgb, (self.normal @ T_ab[:3, :3].T).astype(np.float32), self.triangle)
+        return Mesh(xyz, self.rgb, se3.rotate(T_ab[:3, :3], self.normal).astype(np.float32), self.triangle)
 
 
 class Volume:

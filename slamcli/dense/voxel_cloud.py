@@ -33,7 +33,7 @@ class Cloud:
     def moved(self, T_ab: np.ndarray) -> "Cloud":
         """Return the cloud of frame b in frame a; the order stays."""
         xyz = se3.transform(T_ab, self.xyz.astype(np.float64)).astype(np.float32)
-        return Cloud(xyz, self.rgb, (self.normal @ T_ab[:3, :3].T).astype(np.float32))
+        return Cloud(xyz, self.rgb, se3.rotate(T_ab[:3, :3], self.normal).astype(np.float32))
 
 
 class VoxelCloud:

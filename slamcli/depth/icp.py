@@ -19,6 +19,7 @@ from slamcli.config.options import SensorConfig, SurfaceConfig
 from slamcli.depth import icp_kernels as kernels
 from slamcli.depth import noise_model, oriented_points
 from slamcli.geometry import se3
+from slamcli.geometry.algebra import eigh, product
 from slamcli.geometry.camera import Camera
 
 COLUMNS = 160  # of a coarse depth image, at least
@@ -148,10 +149,10 @@ def align(T_ij: np.ndarray, source: OrientedPoints, target: OrientedPoints, *, p
     prior : what else is known of T_ij
     """
     T = np.array(T_ij, dtype=np.float64, order="C")
-    H_prior, b_prior = np.diag(START_SIGMA**-2.0), np.zeros(6)
+    H_prior, b_prior = np.diag(1.0 / (START_SIGMA * START_SIGMA)), np.zeros(6)
     if prior is not None:
         H_prior = H_prior + prior.information
-        b_prior = prior.information @ se3.log(prior.T @ se3.inverse(T))
+        b_prior = product(prior.information, se3.log(product(prior.T, se3.inverse(T))))
     H, b = np.zeros((6, 6)), np.zeros(6)
     points = (source.xyz, source.normal, source.variance)
     surface = (target.row, target.xyz, target.normal, target.variance, target.pinhole)
@@ -173,7 +174,7 @@ def weakest_sigmas(information: np.ndarray, depth: float) -> np.ndarray:
     information : (6, 6) of a twist [1/m^2, 1/rad^2]; depth : [m] of what is seen, where a turn by 1 rad moves things as far
     """
     scale = np.array([1.0, 1.0, 1.0, 1.0 / depth, 1.0 / depth, 1.0 / depth])
-    values = np.linalg.eigvalsh(scale[:, None] * information * scale)
+    values = eigh(scale[:, None] * information * scale)[0]
     return 1.0 / np.sqrt(np.maximum(values, 1e-12))
 
 

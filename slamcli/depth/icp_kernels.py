@@ -35,7 +35,7 @@ def window_means(depth: f4[:, ::1], side: i8, first: i8, width: i8, out: f4[:, :
             out[v, u] = total / np.float32(n) if 4 * n >= enough else np.nan
 
 
-@kernel(error_model="numpy", fastmath={"contract"})
+@kernel(error_model="numpy")
 def _normal_equations(
     T, xyz_j, normal_j, variance_j, row_i, xyz_i, normal_i, variance_i, pinhole, step, reach, min_cosine, limit, is_final, H, b
 ):  # fmt: skip
@@ -121,7 +121,7 @@ def _normal_equations(
     return met, agree, cost
 
 
-@kernel(error_model="numpy", fastmath={"contract"})
+@kernel(error_model="numpy")
 def align(
     T_ij: f8[:, ::1],
     xyz_j: f4[:, ::1],

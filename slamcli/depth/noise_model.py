@@ -2,10 +2,12 @@
 
 import numpy as np
 
+from slamcli.geometry import elementary
+
 
 def pixel_sigma(octave: np.ndarray, *, pixel_noise: float, octave_scale: float) -> np.ndarray:
     """Return the standard deviation of key points [px]: it grows with the size of the patch they were found in."""
-    return pixel_noise * np.power(octave_scale, np.asarray(octave, dtype=np.float64))
+    return pixel_noise * elementary.power(octave_scale, octave)
 
 
 def depth_sigma(depth: np.ndarray, *, base: float, quadratic: float) -> np.ndarray:

@@ -7,6 +7,7 @@ import numpy as np
 from numba import f4, f8, i4, i8
 
 from slamcli.config.options import SurfaceConfig
+from slamcli.geometry import elementary
 from slamcli.geometry.camera import Camera
 from slamcli.jit.kernel import kernel
 
@@ -55,8 +56,8 @@ def surface(
         1.0 / max(depth_min, 1e-3),
         settings.noise_base,
         settings.noise_quadratic,
-        np.cos(np.radians(settings.max_angle_deg)),
-        np.tan(np.radians(settings.max_angle_deg)) / camera.fx,
+        elementary.cos(np.radians(settings.max_angle_deg)),
+        elementary.tan(np.radians(settings.max_angle_deg)) / camera.fx,
         out.pixel,
         out.xyz_c,
         out.normal_c,

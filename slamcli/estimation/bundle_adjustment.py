@@ -12,6 +12,7 @@ from slamcli.estimation.camera_pose import CHI2_95_2DOF, CHI2_95_3DOF
 from slamcli.estimation.reduced_camera_system import Factor, order_and_blocks
 from slamcli.estimation.relative_pose_factors import NO_EDGES, Edges, EdgeTerms
 from slamcli.geometry import se3
+from slamcli.geometry.algebra import product
 from slamcli.geometry.camera import Camera
 
 DAMPING_START, DAMPING_MIN, DAMPING_MAX = 1e-5, 1e-9, 1e8
@@ -62,14 +63,14 @@ class PoseCovariance:
         for m in np.flatnonzero(place >= 0):
             columns[6 * place[m] : 6 * place[m] + 6, 6 * m : 6 * m + 6] = np.eye(6)
         solved = self._factor.solve(columns)
-        out = columns.T @ solved
+        out = product(columns.T, solved)
         return 0.5 * (out + out.T)
 
     def relative(self, kf_i: int, kf_j: int) -> np.ndarray:
         """Return the covariance (6, 6) of the left twist of T_ij, x_i = T_ij x_j; its inverse is the information of a pose-graph edge."""
-        T_ij = self._T_cw[kf_i] @ se3.inverse(self._T_cw[kf_j])
+        T_ij = product(self._T_cw[kf_i], se3.inverse(self._T_cw[kf_j]))
         J = np.hstack([np.eye(6), -se3.adjoint(T_ij)])
-        return J @ self.joint([kf_i, kf_j]) @ J.T
+        return product(J, self.joint([kf_i, kf_j]), J.T)
 
 
 def adjust(
@@ -139,7 +140,8 @@ def _minimize(
             cost.append(new_cost)
             if is_converged:
                 return T, x, cost, iteration, True
-            damping, growth, is_linearized = max(DAMPING_MIN, damping * max(0.1, 1.0 - (2.0 * gain - 1.0) ** 3)), 2.0, False
+            shift = 2.0 * gain - 1.0
+            damping, growth, is_linearized = max(DAMPING_MIN, damping * max(0.1, 1.0 - shift * shift * shift)), 2.0, False
         else:
             damping, growth = damping * growth, 2.0 * growth
             if damping > DAMPING_MAX:

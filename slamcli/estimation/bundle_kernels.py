@@ -4,7 +4,7 @@ K key frames of which n are free, L landmarks, O observations. `offset` (L+1,) d
 they stand in the order of `place` (K,), a key frame's block in the reduced camera system, -1 where the key frame is fixed.
 `measured` (O, 5) holds per observation u, v [px], depth [m], 1 / sigma_px, 1 / sigma_z. Where 1 / sigma_px is 0 the observation is
 switched off; where 1 / sigma_z is 0 the pixel alone counts. `limits` are the chi2 from which Huber's cost grows like the root, without
-and with depth. Products and sums may be contracted (`fastmath`), nothing else: an observation's NaN would not be hidden.
+and with depth.
 """
 
 import numpy as np
@@ -17,7 +17,7 @@ Z_MIN = 1e-2  # [m] a landmark nearer to the image plane than this, or behind it
 CHI2_BEHIND = 1e6  # what such an observation costs: more than any that can be seen, yet finite, and no slope
 
 
-@kernel(error_model="numpy", fastmath={"contract"})
+@kernel(error_model="numpy")
 def evaluate(
     T: f8[:, :, ::1],
     x_w: f8[:, ::1],
@@ -49,7 +49,7 @@ def evaluate(
     return cost
 
 
-@kernel(error_model="numpy", fastmath={"contract"})
+@kernel(error_model="numpy")
 def linearize(
     T: f8[:, :, ::1],
     x_w: f8[:, ::1],
@@ -141,7 +141,7 @@ def linearize(
             g[5] -= x * q1 - y * q0
 
 
-@kernel(error_model="numpy", fastmath={"contract"})
+@kernel(error_model="numpy")
 def eliminate(
     U: f8[:, :, ::1],
     b_c: f8[:, ::1],
@@ -211,7 +211,7 @@ def eliminate(
                     S[s, i, 5] -= y0 * w05 + y1 * w15 + y2 * w25
 
 
-@kernel(error_model="numpy", fastmath={"contract"})
+@kernel(error_model="numpy")
 def step(
     T: f8[:, :, ::1],
     x_w: f8[:, ::1],

@@ -7,6 +7,7 @@ import numpy as np
 from slamcli.estimation import pose_kernels as kernels
 from slamcli.estimation.minimal_solvers import p3p, rigid3
 from slamcli.geometry import se3
+from slamcli.geometry.algebra import product
 from slamcli.geometry.camera import Camera
 
 CHI2_95_2DOF, CHI2_95_3DOF = 5.991, 7.815  # 95 % quantiles: an observation of a pixel alone, of a pixel and its depth
@@ -91,7 +92,7 @@ def ransac_rigid(
     sample = draw_samples(rng, n, rounds, 3)
     T_ba = rigid3(x_a[sample], x_b[sample])
     R_ab = np.swapaxes(T_ba[:, :, :3], 1, 2)
-    T_ab = np.ascontiguousarray(np.concatenate([R_ab, -R_ab @ T_ba[:, :, 3:]], axis=2))
+    T_ab = np.ascontiguousarray(np.concatenate([R_ab, product(-R_ab, T_ba[:, :, 3:])], axis=2))
     is_inlier = np.zeros(n, dtype=np.bool_)
     best, _ = kernels.rank(
         T_ba, T_ab, x_a, ray_b, x_b, ray_a, True, camera.fx, camera.fy, _squared(threshold_px, n), 3, confidence, is_inlier
@@ -182,7 +183,7 @@ def _rms(T: np.ndarray, x: np.ndarray, ray: np.ndarray, camera: Camera, is_inlie
     """Return the root mean square reprojection error [px] of the inliers, NaN without any."""
     if not is_inlier.any():
         return float("nan")
-    x_c = x @ T[:3, :3].T + T[:3, 3]
+    x_c = se3.transform(T, x)
     with np.errstate(divide="ignore", invalid="ignore"):  # of the others
         u, v = camera.fx * (x_c[:, 0] / x_c[:, 2] - ray[:, 0]), camera.fy * (x_c[:, 1] / x_c[:, 2] - ray[:, 1])
     return float(np.sqrt((u * u + v * v)[is_inlier].mean()))

@@ -2,6 +2,9 @@
 
 import numpy as np
 
+from slamcli.geometry import elementary
+from slamcli.geometry.algebra import eigh, inverse, product
+
 
 def p3p(x: np.ndarray, ray: np.ndarray) -> np.ndarray:
     """Find the poses that see three points along three rays.
@@ -44,7 +47,7 @@ def _distances(laws: np.ndarray) -> np.ndarray:
     ]
     form = np.moveaxis(np.array(rows), -1, 0)
     is_finite = np.all(np.isfinite(form), axis=(1, 2))
-    value, vector = np.linalg.eigh(np.where(is_finite[:, None, None], form, np.eye(3)))
+    value, vector = eigh(np.where(is_finite[:, None, None], form, np.eye(3)))
     # One eigenvalue is 0 up to rounding, the middle one, as those of a pair of real planes have opposite signs.
     slope = np.sqrt(-value[:, 0] / value[:, 2])
     e, f = vector[:, :, 2], vector[:, :, 0]
@@ -67,10 +70,10 @@ def _real_root(b: np.ndarray, c: np.ndarray, d: np.ndarray) -> np.ndarray:
     """Return a real root of x^3 + b x^2 + c x + d: Cardano's where there is one, the largest where there are three; then Newton's method."""
     p, q = c - b * b / 3.0, b * (2.0 * b * b / 27.0 - c / 3.0) + d
     discriminant = 0.25 * q * q + p * p * p / 27.0
-    u = np.cbrt(-0.5 * q - np.copysign(np.sqrt(np.maximum(discriminant, 0.0)), q))
+    u = elementary.cbrt(-0.5 * q - np.copysign(np.sqrt(np.maximum(discriminant, 0.0)), q))
     one = u - np.where(u == 0.0, 0.0, p / (3.0 * u))
     radius = np.sqrt(np.maximum(-p / 3.0, 0.0))
-    largest = 2.0 * radius * np.cos(np.arccos(np.clip(-0.5 * q / radius**3, -1.0, 1.0)) / 3.0)
+    largest = 2.0 * radius * elementary.cos(elementary.arccos(np.clip(-0.5 * q / (radius * radius * radius), -1.0, 1.0)) / 3.0)
     root = np.where(discriminant > 0.0, one, largest) - b / 3.0
     for _ in range(3):
         step = (((root + b) * root + c) * root + d) / ((3.0 * root + 2.0 * b) * root + c)
@@ -99,9 +102,7 @@ def _polish(distances: np.ndarray, laws: np.ndarray) -> np.ndarray:
 def _align(x: np.ndarray, x_c: np.ndarray) -> np.ndarray:
     """Return [R | t] (M, 4, 3, 4) that takes congruent triangles x (M, 3, 3) to x_c (M, 4, 3, 3): edges to edges, normal to normal."""
     frame = _edges_and_normal(x)
-    is_triangle = np.abs(np.linalg.det(frame)) > 0.0
-    inverse = np.linalg.inv(np.where(is_triangle[:, None, None], frame, np.eye(3)))
-    R = _edges_and_normal(x_c) @ np.where(is_triangle[:, None, None], inverse, np.nan)[:, None]
+    R = product(_edges_and_normal(x_c), inverse(frame)[:, None])  # NaN where the points lie on a line
     t = x_c[:, :, 0] - np.einsum("msij,mj->msi", R, x[:, 0])
     return np.concatenate([R, t[..., None]], axis=-1)
 
@@ -122,15 +123,15 @@ def rigid3(x_a: np.ndarray, x_b: np.ndarray) -> np.ndarray:
     """
     mean_a, mean_b = x_a.mean(axis=1), x_b.mean(axis=1)
     E_a, E_b = _plane_frame(x_a), _plane_frame(x_b)
-    uv_a, uv_b = (x_a - mean_a[:, None]) @ E_a, (x_b - mean_b[:, None]) @ E_b
+    uv_a, uv_b = product(x_a - mean_a[:, None], E_a), product(x_b - mean_b[:, None], E_b)
     sine = (uv_a[..., 0] * uv_b[..., 1] - uv_a[..., 1] * uv_b[..., 0]).sum(axis=1)
     cosine = (uv_a[..., 0] * uv_b[..., 0] + uv_a[..., 1] * uv_b[..., 1]).sum(axis=1)
     with np.errstate(invalid="ignore"):
-        norm = np.hypot(sine, cosine)
+        norm = np.sqrt(sine * sine + cosine * cosine)
         s, c = sine / norm, cosine / norm
     zero, one = np.zeros_like(c), np.ones_like(c)
     turn = np.stack([c, -s, zero, s, c, zero, zero, zero, one], axis=-1).reshape(-1, 3, 3)
-    R = E_b @ turn @ np.swapaxes(E_a, 1, 2)
+    R = product(E_b, turn, np.swapaxes(E_a, 1, 2))
     t = mean_b - np.einsum("mij,mj->mi", R, mean_a)
     return np.concatenate([R, t[..., None]], axis=-1)
 

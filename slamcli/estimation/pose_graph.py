@@ -14,10 +14,10 @@ by how much the cost of the whole graph falls without them, one by one and by gr
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import block_diag
 from scipy.sparse.csgraph import connected_components
 
 from slamcli.estimation.pose_graph_solver import Graph
+from slamcli.geometry.algebra import product, pseudo_inverse, solve
 
 CHI2_99_6DOF = 16.81
 GROUP_SPAN = 10  # closures whose ends both lie within so many key frames of each other's claim the same revisit
@@ -167,7 +167,9 @@ def _gain(
         return -np.inf
     rows = (6 * members[:, None] + np.arange(6)).ravel()
     r, P = residual[members].ravel(), covariance[np.ix_(rows, rows)]
-    C = block_diag(*np.linalg.pinv(information[members], hermitian=True))
+    C = np.zeros_like(P)
+    for k, block in enumerate(pseudo_inverse(information[members])):
+        C[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] = block
     if kept.all():
-        return float(r @ np.linalg.pinv(C - P, rcond=1e-9, hermitian=True) @ r) - limit * len(members)
-    return limit * len(members) - float(r @ np.linalg.solve(C + P, r))
+        return float(product(r, pseudo_inverse(C - P, rcond=1e-9), r)) - limit * len(members)
+    return limit * len(members) - float(product(r, solve(C + P, r)))

@@ -5,6 +5,7 @@ from scipy.sparse import coo_array, csr_array
 from scipy.sparse.linalg import SuperLU, splu
 
 from slamcli.geometry import se3
+from slamcli.geometry.algebra import product
 from slamcli.geometry.g2o_convention import to_g2o_information
 
 COLUMNS_AT_ONCE = 240  # of the covariance solved for
@@ -88,7 +89,7 @@ class Graph:
     def residual(self) -> np.ndarray:
         """Return e (E, 6) = log(T_iw T_wj T_ij^-1)."""
         i, j = self.edge_kf.T
-        return se3.log(se3.inverse(self.T_wk[i]) @ self.T_wk[j] @ se3.inverse(self.edge_T_ij))
+        return se3.log(product(se3.inverse(self.T_wk[i]), self.T_wk[j], se3.inverse(self.edge_T_ij)))
 
     def chi2(self) -> np.ndarray:
         """Return e^T Omega e (E,)."""
@@ -101,7 +102,7 @@ class Graph:
 
 
 class Posterior:
-    """What the edges kept leave uncertain."""
+    """What the edges kept leave uncertain. SuperLU's last digits follow the processor; they bear only on which edges are kept."""
 
     def __init__(self, graph: Graph, is_kept: np.ndarray) -> None:
         # e = log(T_iw T_wj T_ij^-1). A left twist of T_iw adds to e as it is; one of T_jw adds minus Ad(T_iw T_wj) times itself. The
@@ -109,7 +110,7 @@ class Posterior:
         place = np.where(graph.is_fixed, -1, 6 * (np.cumsum(~graph.is_fixed) - 1))
         i, j = graph.edge_kf.T
         self._column = place[graph.edge_kf]
-        self._J = (np.broadcast_to(np.eye(6), (len(i), 6, 6)), -se3.adjoint(se3.inverse(graph.T_wk[i]) @ graph.T_wk[j]))
+        self._J = (np.broadcast_to(np.eye(6), (len(i), 6, 6)), -se3.adjoint(product(se3.inverse(graph.T_wk[i]), graph.T_wk[j])))
         self._n = 6 * int((~graph.is_fixed).sum())
         self._factor = self._factorize(graph.information, is_kept)
 
@@ -118,7 +119,7 @@ class Posterior:
         for a in range(2):
             for b in range(2):
                 use = is_kept & (self._column[:, a] >= 0) & (self._column[:, b] >= 0)
-                block = np.swapaxes(self._J[a][use], 1, 2) @ information[use] @ self._J[b][use]
+                block = product(np.swapaxes(self._J[a][use], 1, 2), information[use], self._J[b][use])
                 row = self._column[use, a][:, None, None] + np.arange(6)[:, None]
                 column = self._column[use, b][:, None, None] + np.arange(6)
                 rows.append(np.broadcast_to(row, block.shape).ravel())

@@ -7,6 +7,7 @@ sensor gave none. All arrays are C-contiguous float64 unless said otherwise.
 import numpy as np
 from numba import b1, f8, i8
 
+from slamcli.geometry import elementary
 from slamcli.geometry.cholesky import solve_damped
 from slamcli.geometry.se3 import left_update
 from slamcli.jit.kernel import kernel
@@ -16,7 +17,7 @@ CHI2_BEHIND = 1e6  # what such an observation costs: more than any that can be s
 DAMPING_START, DAMPING_MIN, DAMPING_MAX = 1e-4, 1e-9, 1e6
 
 
-@kernel(error_model="numpy", fastmath={"contract"})
+@kernel(error_model="numpy")
 def _reprojection2(T, p, ray, i, fx, fy):
     """Squared reprojection error [px^2] of point p[i] under pose T (3, 4) against ray[i]."""
     z = T[2, 0] * p[i, 0] + T[2, 1] * p[i, 1] + T[2, 2] * p[i, 2] + T[2, 3]
@@ -27,7 +28,7 @@ def _reprojection2(T, p, ray, i, fx, fy):
     return du * du + dv * dv
 
 
-@kernel(error_model="numpy", fastmath={"contract"})
+@kernel(error_model="numpy")
 def rank(
     T: f8[:, :, ::1],
     T_back: f8[:, :, ::1],
@@ -70,9 +71,9 @@ def rank(
                 break
         if score < best_score and count > 0:
             best, best_score = h, score
-            missed = 1.0 - (count / n) ** size
+            missed = 1.0 - elementary.whole_power(count / n, size)
             if missed < 1.0:
-                needed = 0 if missed <= 0.0 else min(len(T), int(np.log(1.0 - confidence) / np.log(missed)) + 1)
+                needed = 0 if missed <= 0.0 else min(len(T), int(elementary.logarithm(1.0 - confidence) / elementary.logarithm(missed)) + 1)
     if best >= 0:
         for i in range(n):
             error = _reprojection2(T[best], p, ray, i, fx, fy)
@@ -82,7 +83,7 @@ def rank(
     return best, done
 
 
-@kernel(error_model="numpy", fastmath={"contract"})
+@kernel(error_model="numpy")
 def normal_equations(T, x_w, xy, depth, inv_px, inv_z, is_used, camera, chi2_px, chi2_depth, robust, chi2, H, b):
     """Accumulate H = sum w J^T J (upper triangle) and b = -sum w J^T r at pose T; write chi2 (N,); return the robust cost.
 
@@ -157,7 +158,7 @@ def normal_equations(T, x_w, xy, depth, inv_px, inv_z, is_used, camera, chi2_px,
     return cost
 
 
-@kernel(error_model="numpy", fastmath={"contract"})
+@kernel(error_model="numpy")
 def _rms(T, x_w, xy, camera, is_inlier):
     """Compute the root mean square reprojection error [px] of the inliers, NaN without any."""
     total, n = 0.0, 0
@@ -171,7 +172,7 @@ def _rms(T, x_w, xy, camera, is_inlier):
     return np.sqrt(total / n)
 
 
-@kernel(error_model="numpy", fastmath={"contract"})
+@kernel(error_model="numpy")
 def refine(
     T: f8[:, ::1],
     given_x_w: f8[:, ::1],

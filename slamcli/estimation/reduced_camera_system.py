@@ -1,7 +1,7 @@
 """The reduced camera system of bundle adjustment: symmetric, 6 x 6 blocks, one block row per free key frame.
 
 Blocks exist where two key frames share a landmark or an edge. Key frames are put in an order in which those that share landmarks stand close, and
-the system is factorized as a band, or as a dense matrix where the band is wide. SuperLU took four to five times as long as the band, even
+the system is factorized as a band, or as a dense matrix where the band is wide. SuperLU took four to five times as long as a band, even
 for 1500 key frames in a band of 600. What would not fit into memory is solved by conjugate gradients, which need the blocks alone.
 """
 
@@ -9,12 +9,14 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from scipy.linalg import lapack
 from scipy.sparse import bsr_array, csr_array
 from scipy.sparse.csgraph import reverse_cuthill_mckee
-from scipy.sparse.linalg import LinearOperator, cg
+
+from slamcli.geometry import banded_cholesky
+from slamcli.geometry.algebra import inverse, product
 
 ORDER_FROM = 40  # free key frames from which the search for a narrow band pays
+RELATIVE_RESIDUAL, MOST_ITERATIONS = 1e-9, 2000  # of conjugate gradients
 DIRECT_UP_TO = 80_000_000  # numbers in a factor: 640 MB, 1490 key frames that all share landmarks
 
 
@@ -26,12 +28,16 @@ class Factor(Protocol):
 
 
 @dataclass(frozen=True)
-class _LapackFactor:
-    matrix: np.ndarray
-    is_band: bool
+class _CholeskyFactor:
+    upper: np.ndarray  # flat, as `banded_cholesky` has it
+    n: int
+    stride: int
+    reach: int
 
     def solve(self, rhs: np.ndarray) -> np.ndarray:
-        return (lapack.dpbtrs if self.is_band else lapack.dpotrs)(self.matrix, rhs, lower=1)[0]
+        columns = np.array(rhs.reshape(self.n, -1).T, order="C")
+        banded_cholesky.solve(self.upper, self.n, self.stride, self.reach, columns)
+        return columns.T.reshape(rhs.shape)
 
 
 class _EmptyFactor:
@@ -45,12 +51,27 @@ class _ConjugateGradients:
     inverse_diagonal: np.ndarray  # (n, 6, 6)
 
     def solve(self, rhs: np.ndarray) -> np.ndarray:
-        def precondition(v: np.ndarray) -> np.ndarray:
-            return np.einsum("nij,nj->ni", self.inverse_diagonal, v.reshape(-1, 6)).ravel()
+        return np.array([self._solve(column) for column in rhs.reshape(len(rhs), -1).T]).T.reshape(rhs.shape)
 
-        operator = LinearOperator(self.matrix.shape, matvec=precondition, dtype=np.float64)
-        columns = rhs.reshape(len(rhs), -1).T
-        return np.array([cg(self.matrix, c, rtol=1e-9, maxiter=2000, M=operator)[0] for c in columns]).T.reshape(rhs.shape)
+    def _solve(self, rhs: np.ndarray) -> np.ndarray:
+        """Iterate until the residual is RELATIVE_RESIDUAL of the right-hand side: M. Hestenes, E. Stiefel 1952, doi:10.6028/jres.049.044."""
+        x, residual = np.zeros_like(rhs), rhs.copy()
+        direction, before = np.zeros_like(rhs), 1.0
+        for _ in range(MOST_ITERATIONS):
+            if np.sqrt(_dot(residual, residual)) <= RELATIVE_RESIDUAL * np.sqrt(_dot(rhs, rhs)):
+                break
+            conditioned = product(self.inverse_diagonal, residual.reshape(-1, 6, 1)).ravel()
+            now = _dot(residual, conditioned)
+            direction, before = conditioned + now / before * direction, now
+            along = self.matrix @ direction  # of SciPy's own loops, not of BLAS
+            step = now / _dot(direction, along)
+            x += step * direction
+            residual -= step * along
+        return x
+
+
+def _dot(a: np.ndarray, b: np.ndarray) -> float:
+    return float((a * b).sum())
 
 
 class ReducedSystem:
@@ -82,40 +103,33 @@ class ReducedSystem:
             return _EmptyFactor()
         if self.form == "iterative":
             return self._iterative()
-        # An upper triangle by rows is, in Fortran's order, the lower triangle by columns that LAPACK is told of.
-        if self.form == "band":
-            factor, info = lapack.dpbtrf(self._band().T, lower=1, overwrite_ab=1)
-        else:
-            factor, info = lapack.dpotrf(self._dense().T, lower=1, clean=0, overwrite_a=1)
-        return _LapackFactor(factor, self.form == "band") if info == 0 else None
+        size, reach = 6 * self.n, self.bandwidth if self.form == "band" else 6 * self.n - 1
+        stride = reach if self.form == "band" else size
+        upper = self._upper(stride)
+        is_definite = banded_cholesky.factorize(upper, size, stride, reach, np.empty((6, size)))
+        return _CholeskyFactor(upper, size, stride, reach) if is_definite else None
 
-    def _dense(self) -> np.ndarray:
-        matrix = np.zeros((self.n, 6, self.n, 6))
-        matrix[self.row, :, self.column, :] = self.blocks
-        return matrix.reshape(6 * self.n, 6 * self.n)
-
-    def _band(self) -> np.ndarray:
-        """Return (6 n, bandwidth + 1), entry (row, column) of the system at (row, column - row)."""
-        flat = np.zeros(6 * self.n * (self.bandwidth + 1))
+    def _upper(self, stride: int) -> np.ndarray:
+        """Return the upper triangle, entry (row, column) of the system at row * stride + column."""
+        flat = np.zeros(6 * self.n * stride + 6 * self.n)
         for i in range(6):
             for j in range(6):
-                first = 0 if j >= i else self.n  # nothing below the diagonal: that place belongs to the row before
-                flat[(6 * self.row[first:] + i) * self.bandwidth + 6 * self.column[first:] + j] = self.blocks[first:, i, j]
-        return flat.reshape(6 * self.n, -1)
+                first = 0 if j >= i else self.n  # nothing below the diagonal: in a band that place belongs to the row before
+                flat[(6 * self.row[first:] + i) * stride + 6 * self.column[first:] + j] = self.blocks[first:, i, j]
+        return flat
 
     def _iterative(self) -> Factor | None:
         diagonal = np.triu(self.blocks[: self.n])
         diagonal += np.triu(diagonal, 1).transpose(0, 2, 1)
-        try:
-            inverse = np.linalg.inv(diagonal)
-        except np.linalg.LinAlgError:
+        inverted = inverse(diagonal)
+        if not np.isfinite(inverted).all():
             return None
         row = np.concatenate([self.row, self.column[self.n :]])
         column = np.concatenate([self.column, self.row[self.n :]])
         blocks = np.concatenate([diagonal, self.blocks[self.n :], self.blocks[self.n :].transpose(0, 2, 1)])
         order = np.lexsort((column, row))
         start = np.searchsorted(row[order], np.arange(self.n + 1))
-        return _ConjugateGradients(bsr_array((blocks[order], column[order], start), shape=(6 * self.n, 6 * self.n)), inverse)
+        return _ConjugateGradients(bsr_array((blocks[order], column[order], start), shape=(6 * self.n, 6 * self.n)), inverted)
 
 
 def order_and_blocks(

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from slamcli.geometry import se3
+from slamcli.geometry.algebra import product
 
 CHI2_95_6DOF = 12.592  # from which Huber's cost grows like the root
 
@@ -29,8 +30,8 @@ NO_EDGES = Edges(np.empty((0, 2), dtype=np.int64), np.empty((0, 4, 4)), np.empty
 
 def residuals(edges: Edges, T_cw: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return e (E, 6) and the relative poses T_iw T_wj (E, 4, 4) that the key frames have now."""
-    T_ij = T_cw[edges.kf[:, 0]] @ se3.inverse(T_cw[edges.kf[:, 1]])
-    return se3.log(T_ij @ se3.inverse(edges.T_ij)), T_ij
+    T_ij = product(T_cw[edges.kf[:, 0]], se3.inverse(T_cw[edges.kf[:, 1]]))
+    return se3.log(product(T_ij, se3.inverse(edges.T_ij))), T_ij
 
 
 class EdgeTerms:
@@ -62,14 +63,14 @@ class EdgeTerms:
         weight = np.where(robust & (chi2 > CHI2_95_6DOF), np.sqrt(CHI2_95_6DOF / np.maximum(chi2, CHI2_95_6DOF)), 1.0)
         # A left twist of T_iw adds to e as V^-1 does, V being the left Jacobian at e; one of T_jw, minus Ad(T_ij) times itself.
         J_i = _inverse_left_jacobian(e)
-        J = (J_i, -J_i @ se3.adjoint(T_ij))
-        weighted = [np.swapaxes(J_side, 1, 2) @ (weight[:, None, None] * self._edges.information) for J_side in J]
+        J = (J_i, product(-J_i, se3.adjoint(T_ij)))
+        weighted = [product(np.swapaxes(J_side, 1, 2), weight[:, None, None] * self._edges.information) for J_side in J]
         for side in range(2):
             free = self._place[:, side] >= 0
             place = self._place[free, side]
-            np.add.at(U, place, weighted[side][free] @ J[side][free])
+            np.add.at(U, place, product(weighted[side][free], J[side][free]))
             np.add.at(b_c, place, -np.einsum("eij,ej->ei", weighted[side][free], e[free]))
-        blocks = weighted[0][self._joint] @ J[1][self._joint]
+        blocks = product(weighted[0][self._joint], J[1][self._joint])
         self._off_diagonal = np.where(self._is_turned[:, None, None], np.swapaxes(blocks, 1, 2), blocks)
 
     def add_to(self, blocks: np.ndarray) -> None:
@@ -88,4 +89,4 @@ def _inverse_left_jacobian(e: np.ndarray) -> np.ndarray:
     ad = np.zeros((len(e), 6, 6))
     ad[:, :3, :3] = ad[:, 3:, 3:] = se3.hat(e[:, 3:])
     ad[:, :3, 3:] = se3.hat(e[:, :3])
-    return np.eye(6) - 0.5 * ad + ad @ ad / 12.0
+    return np.eye(6) - 0.5 * ad + product(ad, ad) / 12.0

@@ -14,6 +14,7 @@ import numpy as np
 
 from slamcli.estimation.bundle_adjustment import DAMPING_MIN, Problem
 from slamcli.estimation.camera_pose import CHI2_95_2DOF, CHI2_95_3DOF
+from slamcli.geometry.algebra import inverse, product, solve
 
 
 @dataclass(frozen=True)
@@ -50,11 +51,12 @@ def estimate(problem: Problem, columns: np.ndarray, *, prior: np.ndarray, prior_
     solved = factor.solve(np.ascontiguousarray(np.concatenate([reduced, rhs_0[None]]).T)).T
     J = (columns * sqrt_w[:, :, None]).reshape(-1, columns.shape[2])
     through_landmarks = np.array([[_landmark_product(a, problem.V_inv, b) for b in (*lifted, b_0)] for a in lifted])
-    through_map = reduced @ solved.T + through_landmarks
-    A = J.T @ J - through_map[:, :-1] + np.diag(prior_sigma**-2.0)
+    through_map = product(reduced, solved.T) + through_landmarks
+    weight = 1.0 / (prior_sigma * prior_sigma)
+    A = product(J.T, J) - through_map[:, :-1] + np.diag(weight)
     # b is minus the gradient: J_map^T w r = -b_0
-    value = np.linalg.solve(A, J.T @ r.ravel() + through_map[:, -1] + prior * prior_sigma**-2.0)
-    return Shared(value=value, sigma=np.sqrt(np.diag(np.linalg.inv(A))))
+    value = solve(A, product(J.T, r.ravel()) + through_map[:, -1] + prior * weight)
+    return Shared(value=value, sigma=np.sqrt(np.diag(inverse(A))))
 
 
 def _gradient(problem: Problem, measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from slamcli.errors import SlamError
+from slamcli.geometry import elementary
 
 DEPTH_VALUES = 1 << 16  # of a 16-bit depth image
 NO_READING = (0, DEPTH_VALUES - 1)  # 16-bit readings that mean none: 0 everywhere, the largest value of cameras that saturate
@@ -204,8 +205,9 @@ class Camera:
 
     def _equidistant_factor(self, r: np.ndarray) -> np.ndarray:
         """Return by what the distance r from the axis on the plane z = 1 is multiplied: theta (1 + k1 theta^2 + ..) / r."""
-        theta2 = np.arctan(r) ** 2
-        theta_d = np.arctan(r) * (1.0 + theta2 * (self.k1 + theta2 * (self.k2 + theta2 * (self.k3 + theta2 * self.k4))))
+        theta = elementary.arctan2(r, 1.0)
+        theta2 = theta * theta
+        theta_d = theta * (1.0 + theta2 * (self.k1 + theta2 * (self.k2 + theta2 * (self.k3 + theta2 * self.k4))))
         return np.where(r > 1e-9, theta_d / np.maximum(r, 1e-9), 1.0)
 
     def to_dict(self) -> dict:

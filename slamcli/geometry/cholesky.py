@@ -5,7 +5,7 @@ import numpy as np
 from slamcli.jit.kernel import kernel
 
 
-@kernel(error_model="numpy", fastmath={"contract"})
+@kernel(error_model="numpy")
 def solve_damped(H, b, damping, L, out):
     """Solve (H + damping diag H) out = b for 6 unknowns by Cholesky from H's upper triangle; False if it is not positive definite."""
     for j in range(6):

@@ -7,6 +7,7 @@ from functools import cached_property
 import numpy as np
 from numba import f4, f8, i8
 
+from slamcli.geometry import elementary, se3
 from slamcli.geometry.camera import EQUIDISTANT, Camera
 from slamcli.jit.kernel import kernel
 
@@ -27,7 +28,7 @@ class Registration:
         """Return per pixel of the depth camera its ray in the colour camera's axes, (h, w, 3) float32: x_c = depth * ray + t."""
         ray = np.ones((self.depth_camera.height, self.depth_camera.width, 3))
         ray[..., :2] = self.depth_camera.rays
-        return np.ascontiguousarray((ray @ self.T_cd[:3, :3].T).astype(np.float32))
+        return np.ascontiguousarray(se3.rotate(self.T_cd[:3, :3], ray).astype(np.float32))
 
     def apply(self, depth: np.ndarray) -> np.ndarray:
         """Return depth (h, w) float32 [m] of the depth camera as the colour camera would see it, (H, W) float32, NaN = none.
@@ -66,7 +67,7 @@ def bend(x, y, lens, k):
         r = math.sqrt(r2)
         if r < 1e-9:
             return x, y
-        t = math.atan(r)
+        t = elementary.arctangent2(r, 1.0)
         t2 = t * t
         factor = t * (1.0 + t2 * (k[0] + t2 * (k[1] + t2 * (k[4] + t2 * k[5])))) / r
         return x * factor, y * factor

@@ -4,6 +4,7 @@ import math
 
 from numba import f8
 
+from slamcli.geometry import elementary
 from slamcli.jit.kernel import kernel
 
 ROUNDS = 20  # at most; freiburg1's lens, the strongest known here, takes four in its corners
@@ -84,5 +85,5 @@ def undistort_equidistant(raw: f8[:, ::1], k: f8[::1], out: f8[:, ::1]):
             theta = min(max(theta - step, 0.0), WIDEST)
             if not step * step > SMALL:
                 break
-        factor = math.tan(theta) / bent if bent > 1e-12 else 1.0
+        factor = elementary.sine(theta) / elementary.cosine(theta) / bent if bent > 1e-12 else 1.0
         out[i, 0], out[i, 1] = raw[i, 0] * factor, raw[i, 1] * factor

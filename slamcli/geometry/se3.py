@@ -5,10 +5,14 @@ on the left: ``T <- exp(xi) @ T``. Every function takes stacks: (..., 4, 4) matr
 """
 
 import numpy as np
+from numba import float64 as f8
 
 from slamcli.errors import SlamError
+from slamcli.geometry import elementary
+from slamcli.geometry.algebra import eigh, nearest_rotation, product
 from slamcli.jit.kernel import kernel
 
+LINE = 1e-14  # squared ratio of the second extent of points to the first, below which rounding hides which line they leave
 SMALL_ANGLE = 1e-4  # [rad] below this the series in phi^2 are exact to double precision after two terms
 
 
@@ -24,29 +28,49 @@ def hat(phi: np.ndarray) -> np.ndarray:
 def inverse(T_ab: np.ndarray) -> np.ndarray:
     """Invert rigid motions (..., 4, 4) by transposing the rotation."""
     T_ab = np.asarray(T_ab, dtype=np.float64)
-    T_ba = np.zeros_like(T_ab)
-    R_ba = np.swapaxes(T_ab[..., :3, :3], -1, -2)
-    T_ba[..., :3, :3] = R_ba
-    T_ba[..., :3, 3] = -np.einsum("...ij,...j->...i", R_ba, T_ab[..., :3, 3])
-    T_ba[..., 3, 3] = 1.0
+    T_ba = np.empty(T_ab.shape)
+    _invert(np.ascontiguousarray(T_ab).reshape(-1, 4, 4), T_ba.reshape(-1, 4, 4))
     return T_ba
 
 
+@kernel
+def _invert(T: f8[:, :, ::1], out: f8[:, :, ::1]):
+    for s in range(len(T)):
+        for i in range(3):
+            for j in range(3):
+                out[s, i, j] = T[s, j, i]
+            out[s, i, 3] = -(T[s, 0, i] * T[s, 0, 3] + T[s, 1, i] * T[s, 1, 3] + T[s, 2, i] * T[s, 2, 3])
+        out[s, 3, 0] = out[s, 3, 1] = out[s, 3, 2] = 0.0
+        out[s, 3, 3] = 1.0
+
+
 def transform(T_ab: np.ndarray, x_b: np.ndarray) -> np.ndarray:
-    """Map points (N, 3) from frame b to frame a."""
-    return x_b @ T_ab[:3, :3].T + T_ab[:3, 3]
+    """Map points (..., 3) from frame b to frame a, as float64."""
+    return _transformed(T_ab[:3, :3], T_ab[:3, 3], x_b)
 
 
-def _series(angle: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """sin(a)/a, (1 - cos a)/a^2 and (a - sin a)/a^3, safe at a = 0."""
-    small = angle < SMALL_ANGLE
-    a = np.where(small, 1.0, angle)
-    a2 = angle * angle
-    sinc = np.where(small, 1.0 - a2 / 6.0, np.sin(a) / a)
-    half_sinc = np.sin(0.5 * a) / (0.5 * a)  # 1 - cos a loses all digits at small a; 2 sin^2(a/2) does not
-    cosc = np.where(small, 0.5 - a2 / 24.0, 0.5 * half_sinc * half_sinc)
-    cubic = np.where(small, 1.0 / 6.0 - a2 / 120.0, (a - np.sin(a)) / (a * a * a))
-    return sinc, cosc, cubic
+def rotate(R_ab: np.ndarray, v_b: np.ndarray) -> np.ndarray:
+    """Turn vectors (..., 3) from the axes of b to those of a, as float64."""
+    return _transformed(R_ab, np.zeros(3), v_b)
+
+
+def _transformed(R: np.ndarray, t: np.ndarray, x: np.ndarray) -> np.ndarray:
+    x = np.ascontiguousarray(x, dtype=np.float64)
+    out = np.empty(x.shape)
+    R, t = (np.ascontiguousarray(value, dtype=np.float64) for value in (R, t))
+    _transform(R, t, x.reshape(-1, 3), out.reshape(-1, 3))
+    return out
+
+
+@kernel
+def _transform(R: f8[:, ::1], t: f8[::1], x: f8[:, ::1], out: f8[:, ::1]):
+    r00, r01, r02, r10, r11, r12, r20, r21, r22 = R[0, 0], R[0, 1], R[0, 2], R[1, 0], R[1, 1], R[1, 2], R[2, 0], R[2, 1], R[2, 2]
+    t0, t1, t2 = t[0], t[1], t[2]
+    for n in range(len(x)):
+        a, b, c = x[n, 0], x[n, 1], x[n, 2]
+        out[n, 0] = r00 * a + r01 * b + r02 * c + t0
+        out[n, 1] = r10 * a + r11 * b + r12 * c + t1
+        out[n, 2] = r20 * a + r21 * b + r22 * c + t2
 
 
 def exp(xi: np.ndarray) -> np.ndarray:
@@ -54,34 +78,48 @@ def exp(xi: np.ndarray) -> np.ndarray:
 
     T. Barfoot, State Estimation for Robotics, 2017, section 7.1.
     """
-    xi = np.asarray(xi, dtype=np.float64)
-    Phi = hat(xi[..., 3:])
-    Phi2 = Phi @ Phi
-    sinc, cosc, cubic = (s[..., None, None] for s in _series(np.linalg.norm(xi[..., 3:], axis=-1)))
-    T = np.zeros(xi.shape[:-1] + (4, 4))
-    T[..., :3, :3] = np.eye(3) + sinc * Phi + cosc * Phi2
-    V = np.eye(3) + cosc * Phi + cubic * Phi2
-    T[..., :3, 3] = np.einsum("...ij,...j->...i", V, xi[..., :3])
-    T[..., 3, 3] = 1.0
+    xi = np.ascontiguousarray(xi, dtype=np.float64)
+    T = np.empty((*xi.shape[:-1], 4, 4))
+    _exp(xi.reshape(-1, 6), T.reshape(-1, 4, 4))
     return T
+
+
+@kernel(error_model="numpy")
+def _exp(xi: f8[:, ::1], T: f8[:, :, ::1]):
+    for s in range(len(xi)):
+        for i in range(4):
+            for j in range(4):
+                T[s, i, j] = 1.0 if i == j else 0.0
+        left_update(T[s], xi[s])
 
 
 def log(T: np.ndarray) -> np.ndarray:
     """Map rigid motions (..., 4, 4) to twists (..., 6) with rotation angle in [0, pi]."""
-    T = np.asarray(T, dtype=np.float64)
-    quaternion = quaternion_xyzw(T)
-    quaternion = np.where(quaternion[..., 3:] < 0.0, -quaternion, quaternion)
-    sine = np.linalg.norm(quaternion[..., :3], axis=-1)
-    angle = 2.0 * np.arctan2(sine, quaternion[..., 3])
-    # angle / sin(angle / 2) -> 2 as the angle vanishes; the quaternion keeps full precision both there and at pi.
-    phi = quaternion[..., :3] * np.where(sine < SMALL_ANGLE, 2.0, angle / np.where(sine == 0.0, 1.0, sine))[..., None]
-    Phi = hat(phi)
-    sinc, cosc, _ = _series(angle)
-    safe = np.where(angle < SMALL_ANGLE, 1.0, angle)
-    quadratic = np.where(angle < SMALL_ANGLE, 1.0 / 12.0, (1.0 - 0.5 * sinc / cosc) / (safe * safe))
-    V_inverse = np.eye(3) - 0.5 * Phi + quadratic[..., None, None] * (Phi @ Phi)
-    rho = np.einsum("...ij,...j->...i", V_inverse, T[..., :3, 3])
-    return np.concatenate([rho, phi], axis=-1)
+    T = np.ascontiguousarray(T, dtype=np.float64)
+    xi = np.empty((*T.shape[:-2], 6))
+    quaternion = np.ascontiguousarray(quaternion_xyzw(T)).reshape(-1, 4)
+    _log(T.reshape(-1, 4, 4), quaternion, xi.reshape(-1, 6))
+    return xi
+
+
+@kernel(error_model="numpy")
+def _log(T: f8[:, :, ::1], quaternion: f8[:, ::1], xi: f8[:, ::1]):
+    for s in range(len(T)):
+        sign = -1.0 if quaternion[s, 3] < 0.0 else 1.0
+        x, y, z, w = sign * quaternion[s, 0], sign * quaternion[s, 1], sign * quaternion[s, 2], sign * quaternion[s, 3]
+        sine = np.sqrt(x * x + y * y + z * z)
+        angle = 2.0 * elementary.arctangent2(sine, w)
+        # angle / sin(angle / 2) -> 2 as the angle vanishes; the quaternion keeps full precision both there and at pi.
+        scale = 2.0 if sine < SMALL_ANGLE else angle / sine
+        p0, p1, p2 = scale * x, scale * y, scale * z
+        sinc, cosc, _ = series(angle)
+        quadratic = 1.0 / 12.0 if angle < SMALL_ANGLE else (1.0 - 0.5 * sinc / cosc) / (angle * angle)
+        t0, t1, t2 = T[s, 0, 3], T[s, 1, 3], T[s, 2, 3]
+        c0, c1, c2 = p1 * t2 - p2 * t1, p2 * t0 - p0 * t2, p0 * t1 - p1 * t0  # phi x t
+        xi[s, 0] = t0 - 0.5 * c0 + quadratic * (p1 * c2 - p2 * c1)
+        xi[s, 1] = t1 - 0.5 * c1 + quadratic * (p2 * c0 - p0 * c2)
+        xi[s, 2] = t2 - 0.5 * c2 + quadratic * (p0 * c1 - p1 * c0)
+        xi[s, 3], xi[s, 4], xi[s, 5] = p0, p1, p2
 
 
 def adjoint(T_ab: np.ndarray) -> np.ndarray:
@@ -90,7 +128,7 @@ def adjoint(T_ab: np.ndarray) -> np.ndarray:
     R = T_ab[..., :3, :3]
     out = np.zeros(T_ab.shape[:-2] + (6, 6))
     out[..., :3, :3] = R
-    out[..., :3, 3:] = hat(T_ab[..., :3, 3]) @ R
+    out[..., :3, 3:] = product(hat(T_ab[..., :3, 3]), R)
     out[..., 3:, 3:] = R
     return out
 
@@ -115,11 +153,12 @@ def quaternion_xyzw(T: np.ndarray) -> np.ndarray:
 
 def from_quaternion(position: np.ndarray, quaternion: np.ndarray) -> np.ndarray:
     """Build rigid motions (..., 4, 4) from positions (..., 3) and quaternions (..., 4) x y z w, which need not be unit."""
-    from scipy.spatial.transform import Rotation
-
     quaternion = np.asarray(quaternion, dtype=np.float64)
+    x, y, z, w = np.moveaxis(quaternion / np.linalg.norm(quaternion, axis=-1, keepdims=True), -1, 0)
     T = np.zeros(quaternion.shape[:-1] + (4, 4))
-    T[..., :3, :3] = Rotation.from_quat(quaternion.reshape(-1, 4)).as_matrix().reshape(quaternion.shape[:-1] + (3, 3))
+    T[..., 0, 0], T[..., 0, 1], T[..., 0, 2] = 1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)
+    T[..., 1, 0], T[..., 1, 1], T[..., 1, 2] = 2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)
+    T[..., 2, 0], T[..., 2, 1], T[..., 2, 2] = 2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)
     T[..., :3, 3] = position
     T[..., 3, 3] = 1.0
     return T
@@ -131,9 +170,7 @@ def orthonormalize(T: np.ndarray) -> np.ndarray:
     Every law here, `inverse` first, rests on orthonormal rotations; solvers of polynomials and long products do not keep them so.
     """
     T = np.array(T, dtype=np.float64)
-    U, _, Vt = np.linalg.svd(T[..., :3, :3])
-    U[..., 2] *= np.linalg.det(U @ Vt)[..., None]  # a rotation, where the nearest orthonormal matrix were a reflection
-    T[..., :3, :3] = U @ Vt
+    T[..., :3, :3] = nearest_rotation(T[..., :3, :3])
     T[..., 3, :] = [0.0, 0.0, 0.0, 1.0]
     return T
 
@@ -141,7 +178,7 @@ def orthonormalize(T: np.ndarray) -> np.ndarray:
 def interpolate(T_wa: np.ndarray, T_wb: np.ndarray, alpha: np.ndarray | float) -> np.ndarray:
     """Go the share `alpha` of the screw motion from a to b; 0 gives `T_wa`, 1 gives `T_wb`, values outside extrapolate."""
     alpha = np.asarray(alpha, dtype=np.float64)
-    return T_wa @ exp(alpha[..., None] * log(inverse(T_wa) @ T_wb))
+    return product(T_wa, exp(alpha[..., None] * log(product(inverse(T_wa), T_wb))))
 
 
 def umeyama(x_a: np.ndarray, x_b: np.ndarray, *, with_scale: bool = False) -> tuple[np.ndarray, float]:
@@ -158,29 +195,35 @@ def umeyama(x_a: np.ndarray, x_b: np.ndarray, *, with_scale: bool = False) -> tu
         raise SlamError(f"alignment needs at least 3 point pairs, got {len(x_a)}")
     mean_a, mean_b = x_a.mean(axis=0), x_b.mean(axis=0)
     d_a, d_b = x_a - mean_a, x_b - mean_b
-    U, singular, Vt = np.linalg.svd(d_b.T @ d_a / len(x_a))
-    if singular[1] <= 1e-12 * max(singular[0], 1e-300):
-        raise SlamError("alignment is undetermined: the points lie on one line")
-    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(U) * np.linalg.det(Vt))])
-    R_ba = (U * sign) @ Vt
-    scale = float((singular * sign).sum() / (d_a * d_a).sum(axis=1).mean()) if with_scale else 1.0
+    for d in (d_a, d_b):
+        spread = eigh(product(d.T, d))[0]  # squared extents along the principal axes
+        if not spread[1] > LINE * spread[2]:
+            raise SlamError("alignment is undetermined: the points lie on one line")
+    covariance = product(d_b.T, d_a) / len(x_a)
+    R_ba = nearest_rotation(covariance)
+    scale = float((R_ba * covariance).sum() / (d_a * d_a).sum(axis=1).mean()) if with_scale else 1.0
     T_ba = np.eye(4)
     T_ba[:3, :3] = R_ba
-    T_ba[:3, 3] = mean_b - scale * R_ba @ mean_a
+    T_ba[:3, 3] = mean_b - scale * product(R_ba, mean_a)
     return T_ba, scale
 
 
-@kernel
+@kernel(error_model="numpy")
+def series(angle):
+    """Return sin(a) / a, (1 - cos a) / a^2 and (a - sin a) / a^3 of an angle, safe at a = 0."""
+    a2 = angle * angle
+    if angle < SMALL_ANGLE:
+        return 1.0 - a2 / 6.0, 0.5 - a2 / 24.0, 1.0 / 6.0 - a2 / 120.0
+    sine, half = elementary.sine(angle), elementary.sine(0.5 * angle) / (0.5 * angle)
+    # 1 - cos a loses all digits at small a; 2 sin^2(a/2) does not
+    return sine / angle, 0.5 * half * half, (angle - sine) / (a2 * angle)
+
+
+@kernel(error_model="numpy")
 def left_update(T, xi):
     """Replace T (4, 4) in place by exp(xi) @ T, written out for use inside kernels."""
     p0, p1, p2 = xi[3], xi[4], xi[5]
-    a2 = p0 * p0 + p1 * p1 + p2 * p2
-    a = np.sqrt(a2)
-    if a < 1e-4:
-        sinc, cosc, cubic = 1.0 - a2 / 6.0, 0.5 - a2 / 24.0, 1.0 / 6.0 - a2 / 120.0
-    else:
-        half = np.sin(0.5 * a) / (0.5 * a)
-        sinc, cosc, cubic = np.sin(a) / a, 0.5 * half * half, (a - np.sin(a)) / (a2 * a)
+    sinc, cosc, cubic = series(np.sqrt(p0 * p0 + p1 * p1 + p2 * p2))
     r00, r01, r02 = 1.0 - cosc * (p1 * p1 + p2 * p2), -sinc * p2 + cosc * p0 * p1, sinc * p1 + cosc * p0 * p2
     r10, r11, r12 = sinc * p2 + cosc * p0 * p1, 1.0 - cosc * (p0 * p0 + p2 * p2), -sinc * p0 + cosc * p1 * p2
     r20, r21, r22 = -sinc * p1 + cosc * p0 * p2, sinc * p0 + cosc * p1 * p2, 1.0 - cosc * (p0 * p0 + p1 * p1)

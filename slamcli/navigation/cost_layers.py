@@ -3,6 +3,7 @@
 import numpy as np
 
 from slamcli.errors import SlamError
+from slamcli.geometry import elementary
 from slamcli.navigation.planner import end_cell, obstacle_distance
 from slamcli.schema import Grid
 
@@ -23,7 +24,7 @@ def inflated(grid: Grid, *, radius: float, reach: float, falloff: float) -> np.n
         if not (np.isfinite(value) and 0.0 <= value <= 100.0):
             raise SlamError(f"{name} = {value:g}: must be from 0 to 100")
     distance = obstacle_distance(grid, allow_unknown=True)
-    cost = np.rint(NEAREST * np.exp(-falloff * np.maximum(distance - radius, 0.0)))
+    cost = np.rint(NEAREST * elementary.exp(-falloff * np.maximum(distance - radius, 0.0)))
     cost = np.where(distance > reach, 0, np.where(distance < radius, INSCRIBED, cost))
     cost = np.where(grid.state == 1, LETHAL, np.where(grid.state < 0, UNKNOWN, cost))
     return cost.astype(np.int8)

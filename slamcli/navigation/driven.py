@@ -45,7 +45,7 @@ def _along(xy: np.ndarray, *, step: float) -> np.ndarray:
     xy = xy[np.isfinite(xy).all(axis=1)]
     found = [xy[:1]]
     for a, b in zip(xy[:-1], xy[1:], strict=True):
-        length = float(np.linalg.norm(b - a))
+        length = float(np.linalg.norm(b - a, axis=-1))
         n = int(np.ceil(length / step)) if length <= LONGEST_STEP else 1
         found.append(a + (b - a) * np.arange(1, n + 1)[:, None] / max(n, 1))
     return np.concatenate(found)

@@ -10,6 +10,8 @@ from collections.abc import Iterable
 import numpy as np
 
 from slamcli.config.options import GroundConfig
+from slamcli.geometry import elementary
+from slamcli.geometry.algebra import eigh, product
 from slamcli.geometry.camera import Camera
 from slamcli.navigation.floor_paper import paper_plane
 from slamcli.navigation.surface_patches import Patches, Support, collect, fit_plane
@@ -50,11 +52,11 @@ def find_ground(
         support = lowest_plane(patches, up, settings=settings)
     if support is None:
         return _not_found(T_wc, up)
-    above = float(np.median(T_wk[:, :3, 3] @ support.plane[:3] + support.plane[3]))
+    above = float(np.median(product(T_wk[:, :3, 3], support.plane[:3]) + support.plane[3]))
     plane = support.plane if above >= 0.0 else -support.plane  # the camera is above the floor
-    if abs(above) < settings.min_height or plane[:3] @ up < settings.min_cosine:  # a table at eye level, a wall
+    if abs(above) < settings.min_height or product(plane[:3], up) < settings.min_cosine:  # a table at eye level, a wall
         return _not_found(T_wc, up)
-    distance = patches.xyz[support.inliers] @ plane[:3] + plane[3]
+    distance = product(patches.xyz[support.inliers], plane[:3]) + plane[3]
     return Ground(
         T_lw=level_frame(plane, T_wc),
         plane=plane,
@@ -76,9 +78,9 @@ def vertical(patches: Patches, T_wk: np.ndarray) -> np.ndarray:
     upright += [np.cross(a, right.mean(axis=0)) for a in frequent[:4]]
     for direction in (*frequent, *(_unit(d, best) for d in upright), best):
         direction = direction * _sign(direction, T_wk)
-        cosine = np.abs(normal @ direction)
+        cosine = np.abs(product(normal, direction))
         claim = np.mean(cosine > PARALLEL) + 0.5 * np.mean(cosine < ORTHOGONAL) if len(normal) else 1.0
-        score = claim * np.exp(-0.5 * (right @ direction / UPRIGHT_ROLL) ** 2).mean()
+        score = claim * elementary.exp(-0.5 * (product(right, direction) / UPRIGHT_ROLL) ** 2).mean()
         if score > best_score and _suits_camera(direction, T_wk):
             best, best_score = direction, score
     return best
@@ -86,9 +88,9 @@ def vertical(patches: Patches, T_wk: np.ndarray) -> np.ndarray:
 
 def _sign(direction: np.ndarray, T_wk: np.ndarray) -> float:
     """Return the sign that makes a vertical direction point up: as the images do or, where these lie flat, against the view."""
-    lean = float((-T_wk[:, :3, 1] @ direction).mean())
+    lean = float(product(-T_wk[:, :3, 1], direction).mean())
     if abs(lean) < UPRIGHT_MIN:
-        lean = float((-T_wk[:, :3, 2] @ direction).mean())
+        lean = float(product(-T_wk[:, :3, 2], direction).mean())
     return 1.0 if lean >= 0.0 else -1.0
 
 
@@ -97,21 +99,23 @@ def _suits_camera(up: np.ndarray, T_wk: np.ndarray) -> bool:
 
     A wall before an upright camera is told from a floor below one that looks down by the latter's turning about the view.
     """
-    if (-T_wk[:, :3, 1] @ up).mean() >= UPRIGHT_MIN:
+    if product(-T_wk[:, :3, 1], up).mean() >= UPRIGHT_MIN:
         return True
     right = T_wk[:, :3, 0]
-    turns = np.linalg.eigvalsh(right.T @ right / len(right))[1]
-    return bool(turns > TURNING and (-T_wk[:, :3, 2] @ up).mean() > PARALLEL)
+    turns = eigh(product(right.T, right) / len(right))[0][1]
+    return bool(turns > TURNING and product(-T_wk[:, :3, 2], up).mean() > PARALLEL)
 
 
 def _unit(vector: np.ndarray, otherwise: np.ndarray) -> np.ndarray:
-    length = np.linalg.norm(vector)
+    length = np.linalg.norm(vector, axis=-1)
     return vector / length if length > 1e-3 else otherwise
 
 
 def _frequent_directions(normal: np.ndarray, *, count: int = 24) -> list[np.ndarray]:
     """Return the directions (3,) most normals share, refined to the mean of those near each; opposite normals count as one."""
-    bins = np.round(normal * 6.0).astype(np.int64) @ [169, 13, 1]  # -6..6 per axis; the opposite normal's number is the negative
+    bins = (np.round(normal * 6.0).astype(np.int64) * [169, 13, 1]).sum(
+        axis=-1
+    )  # -6..6 per axis; the opposite normal's number is the negative
     counts = np.bincount(np.abs(bins))
     directions = []
     for number in np.argsort(-counts, kind="stable")[:count]:
@@ -120,25 +124,25 @@ def _frequent_directions(normal: np.ndarray, *, count: int = 24) -> list[np.ndar
             break
         direction = (normal[members] * np.where(bins[members] < 0, -1.0, 1.0)[:, None]).sum(axis=0)
         for least in (0.94, 0.97, PARALLEL, PARALLEL):
-            cosine = normal @ (direction / np.linalg.norm(direction))
+            cosine = product(normal, direction / np.linalg.norm(direction, axis=-1))
             near = np.abs(cosine) > least
             direction = (normal[near] * np.sign(cosine[near])[:, None]).sum(axis=0)
             if not direction.any():
                 break
         else:
-            directions.append(direction / np.linalg.norm(direction))
+            directions.append(direction / np.linalg.norm(direction, axis=-1))
     return directions
 
 
 def lowest_plane(patches: Patches, up: np.ndarray, *, settings: GroundConfig) -> Support | None:
     """Find the lowest horizontal plane that enough patches support and that has no surface below it; None where there is none."""
-    rows = np.flatnonzero(patches.normal @ up > settings.min_cosine)
+    rows = np.flatnonzero(product(patches.normal, up) > settings.min_cosine)
     least = max(settings.min_patches, settings.min_share * len(rows))
     if len(rows) < least:
         return None
-    for level in _levels(patches.xyz[rows] @ up, least):
+    for level in _levels(product(patches.xyz[rows], up), least):
         support = _refined(patches, rows, np.append(up, -level), least, settings)
-        if support and support.plane[:3] @ up > settings.min_cosine and _nothing_below(patches, support, settings):
+        if support and product(support.plane[:3], up) > settings.min_cosine and _nothing_below(patches, support, settings):
             return support
     return None
 
@@ -147,7 +151,7 @@ def _refined(patches: Patches, rows: np.ndarray, plane: np.ndarray, least: float
     """Fit a plane to the patches near it, [L] (18), drawing them closer from round to round; None when too few are left."""
     inliers = rows
     for half_width in (PEAK_HALF_WIDTH, 0.5 * PEAK_HALF_WIDTH, settings.distance, settings.distance):
-        residual = patches.xyz[rows] @ plane[:3] + plane[3]
+        residual = product(patches.xyz[rows], plane[:3]) + plane[3]
         inliers = rows[np.abs(residual) < half_width + 2.0 * patches.sigma[rows]]
         if len(inliers) < least:
             return None
@@ -168,7 +172,7 @@ def _levels(height: np.ndarray, least: float) -> np.ndarray:
 
 def _nothing_below(patches: Patches, support: Support, settings: GroundConfig) -> bool:
     """Say whether hardly anything lies below a plane: under a table top the room goes on."""
-    height = patches.xyz @ support.plane[:3] + support.plane[3]
+    height = product(patches.xyz, support.plane[:3]) + support.plane[3]
     below = np.count_nonzero(height < -0.1 - 3.0 * patches.sigma)
     return bool(below <= settings.max_below * len(support.inliers))
 
@@ -176,19 +180,19 @@ def _nothing_below(patches: Patches, support: Support, settings: GroundConfig) -
 def level_frame(plane: np.ndarray, T_wc: np.ndarray) -> np.ndarray:
     """Return T_lw (4, 4): z along the plane's normal, z = 0 on it, origin below the camera T_wc, x along that camera's heading."""
     up = plane[:3]
-    heading = T_wc[:3, 2] - (T_wc[:3, 2] @ up) * up
-    if np.linalg.norm(heading) < 0.2:  # looking straight down: the image's up is ahead
-        heading = -T_wc[:3, 1] + (T_wc[:3, 1] @ up) * up
-    x = heading / np.linalg.norm(heading)
+    heading = T_wc[:3, 2] - product(T_wc[:3, 2], up) * up
+    if np.linalg.norm(heading, axis=-1) < 0.2:  # looking straight down: the image's up is ahead
+        heading = -T_wc[:3, 1] + product(T_wc[:3, 1], up) * up
+    x = heading / np.linalg.norm(heading, axis=-1)
     T_lw = np.eye(4)
     T_lw[:3, :3] = np.stack([x, np.cross(up, x), up])
-    foot = T_wc[:3, 3] - (T_wc[:3, 3] @ up + plane[3]) * up
-    T_lw[:3, 3] = -T_lw[:3, :3] @ foot
+    foot = T_wc[:3, 3] - (product(T_wc[:3, 3], up) + plane[3]) * up
+    T_lw[:3, 3] = product(-T_lw[:3, :3], foot)
     return T_lw
 
 
 def _not_found(T_wc: np.ndarray, up: np.ndarray) -> Ground:
-    plane = np.append(up, -up @ T_wc[:3, 3])
+    plane = np.append(up, product(-up, T_wc[:3, 3]))
     return Ground(
         T_lw=level_frame(plane, T_wc),
         plane=plane,

@@ -8,6 +8,7 @@ desk, or a wall, whose gradients are all equal while those of a floor grow with 
 import numpy as np
 
 from slamcli.config.options import GroundConfig
+from slamcli.geometry.algebra import product
 from slamcli.navigation.surface_patches import Patches, Support, fit_plane
 
 CLASSES = 3  # most frequent gradients kept
@@ -33,12 +34,12 @@ def paper_plane(patches: Patches, up: np.ndarray, *, settings: GroundConfig, rng
         plane = _plane_through(xyz[rng.integers(first[chosen], last[chosen])])
         if plane is None:
             continue
-        count = int(np.count_nonzero(np.abs(xyz @ plane[:3] + plane[3]) < settings.distance))
+        count = int(np.count_nonzero(np.abs(product(xyz, plane[:3]) + plane[3]) < settings.distance))
         if count > best_count:
             best, best_count = plane, count
     if best is None or best_count < 3:
         return None
-    inliers = rows[np.abs(xyz @ best[:3] + best[3]) < settings.distance]
+    inliers = rows[np.abs(product(xyz, best[:3]) + best[3]) < settings.distance]
     return Support(fit_plane(patches.xyz[inliers], np.ones(len(inliers)), best), inliers, len(rows))
 
 
@@ -54,7 +55,7 @@ def ground_points(patches: Patches, up: np.ndarray, *, settings: GroundConfig) -
 
 def ground_frames(patches: Patches, up: np.ndarray) -> np.ndarray:
     """Return the key frames with the most patches that face up, at least three."""
-    count = np.bincount(patches.frame[patches.normal @ up > FACES_UP], minlength=int(patches.frame.max(initial=-1)) + 1)
+    count = np.bincount(patches.frame[product(patches.normal, up) > FACES_UP], minlength=int(patches.frame.max(initial=-1)) + 1)
     return np.sort(np.argsort(-count, kind="stable")[: max(3, int(np.ceil(GROUND_SHARE * len(count))))])
 
 
@@ -77,8 +78,8 @@ def image_gradient(patches: Patches) -> np.ndarray:
 def _plane_through(xyz: np.ndarray) -> np.ndarray | None:
     """Return the plane (4,) through three points (3, 3), None where they lie on a line."""
     normal = np.cross(xyz[1] - xyz[0], xyz[2] - xyz[0])
-    length = np.linalg.norm(normal)
+    length = np.linalg.norm(normal, axis=-1)
     if length < 1e-6:
         return None
     normal = normal / length
-    return np.append(normal, -normal @ xyz[0])
+    return np.append(normal, product(-normal, xyz[0]))

@@ -14,6 +14,7 @@ from numba import b1, f8, i4, i8, u2
 
 from slamcli.config.options import GridConfig, SensorConfig
 from slamcli.errors import SlamError
+from slamcli.geometry import elementary
 from slamcli.geometry.camera import Camera
 from slamcli.jit.kernel import kernel
 from slamcli.navigation import hanging
@@ -56,12 +57,12 @@ def spaced(T_lc: np.ndarray, *, metres: float, degrees: float) -> np.ndarray:
     T_lc : (F, 4, 4) camera poses. Key frames are fewer than a grid needs: they see all landmarks, but not all floor, twice.
     """
     chosen: list[int] = []
-    most = np.cos(np.radians(degrees))
+    most = elementary.cos(np.radians(degrees))
     for i in np.flatnonzero(np.isfinite(T_lc[:, :3]).all(axis=(1, 2))):
         if chosen:
             T = T_lc[chosen[-1]]
             cosine = 0.5 * (np.sum(T[:3, :3] * T_lc[i, :3, :3]) - 1.0)  # trace of the rotation between them
-            if np.linalg.norm(T_lc[i, :3, 3] - T[:3, 3]) < metres and cosine > most:
+            if np.linalg.norm(T_lc[i, :3, 3] - T[:3, 3], axis=-1) < metres and cosine > most:
                 continue
         chosen.append(int(i))
     return np.array(chosen, dtype=np.int64)

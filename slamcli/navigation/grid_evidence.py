@@ -8,6 +8,7 @@ from numba import f4, f8, i4, i8, u1, u2
 
 from slamcli.config.options import GridConfig, SensorConfig
 from slamcli.errors import SlamError
+from slamcli.geometry import se3
 from slamcli.jit.kernel import kernel
 
 SLICES = 16  # of the band's height, one bit each
@@ -234,12 +235,9 @@ def _extend_down(
     lowest = depth[height - height // 16 :, u][::-1]
     is_reading = (lowest >= s.min_range) & (lowest <= s.max_range)
     u, v = u[is_reading.any(axis=0)], height - 1 - is_reading.argmax(axis=0)[is_reading.any(axis=0)]
-    at, above = (
-        np.column_stack([depth[v, u, None] * rays[v, u], depth[v, u]]).astype(np.float64) @ T_lk[:3, :3].T + T_lk[:3, 3]
-        for v in (v, v - height // 12)
-    )
+    at, above = (se3.transform(T_lk, np.column_stack([depth[v, u, None] * rays[v, u], depth[v, u]])) for v in (v, v - height // 12))
     step = np.abs(at - above)
-    is_upright = (at[:, 2] >= s.band_high) & (step[:, 2] > 3.0 * np.hypot(step[:, 0], step[:, 1]))
+    is_upright = (at[:, 2] >= s.band_high) & (step[:, 2] > 3.0 * np.linalg.norm(step[:, :2], axis=1))
     j, i = np.floor(at[is_upright, :2] / s.resolution - corner).astype(np.int64).T
     inside = (i >= 0) & (j >= 0) & (i < n_band.shape[0]) & (j < n_band.shape[1])
     np.add.at(n_band, (i[inside], j[inside]), 1)

@@ -8,6 +8,7 @@ import numpy as np
 from scipy import ndimage
 
 from slamcli.config.options import GridConfig
+from slamcli.geometry import elementary
 from slamcli.geometry.octree import Octree
 from slamcli.jit.kernel import kernel
 from slamcli.navigation.grid import DEEPEST, FREE, OCCUPIED, UNKNOWN, check_size
@@ -41,7 +42,7 @@ def grid_from_octree(tree: Octree, *, settings: GridConfig) -> Grid:
     state[is_known] = FREE
     state[full > 0] = OCCUPIED
     p_occupied = np.where(
-        full > 0, 1.0 / (1.0 + np.exp(-odds)), np.where(state == FREE, np.minimum(1.0 / (1.0 + np.exp(-odds)), 0.5), np.nan)
+        full > 0, 1.0 / (1.0 + elementary.exp(-odds)), np.where(state == FREE, np.minimum(1.0 / (1.0 + elementary.exp(-odds)), 0.5), np.nan)
     )
     return Grid(
         p_occupied=p_occupied.astype(np.float32), n_seen=known, state=state, origin=corner * resolution, resolution=np.array(resolution)

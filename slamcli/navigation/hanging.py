@@ -8,6 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from slamcli.geometry import elementary
+from slamcli.geometry.algebra import product
+
 GAP = 1  # [cells] between faces of one thing
 GROWTH = 0.6  # [cells] by which a rectangle through the middles of cells is grown to hold the cells, rounding included
 MARGIN = 4.0  # [cells] by which a thing may be larger than what was seen of its sides
@@ -71,19 +74,25 @@ class Rectangle:
 def fit_rectangle(xy: np.ndarray) -> Rectangle:
     """Fit the rectangle around points (N, 2) [cells] whose sides are the closest to them."""
     angle = np.radians(np.arange(0.0, 90.0, ANGLE_STEP))
-    axes = np.stack([np.stack([np.cos(angle), np.sin(angle)], axis=1), np.stack([-np.sin(angle), np.cos(angle)], axis=1)], axis=1)
-    along = axes @ xy.T  # (angles, 2, N)
+    axes = np.stack(
+        [
+            np.stack([elementary.cos(angle), elementary.sin(angle)], axis=1),
+            np.stack([-elementary.sin(angle), elementary.cos(angle)], axis=1),
+        ],
+        axis=1,
+    )
+    along = product(axes, xy.T)  # (angles, 2, N)
     low, high = along.min(axis=2, keepdims=True), along.max(axis=2, keepdims=True)
     distance = np.minimum(along - low, high - along).min(axis=1)
     best = int(np.argmax((1.0 / np.maximum(distance, CLOSEST)).sum(axis=1)))
     middle = 0.5 * (low + high)[best, :, 0]
-    return Rectangle(axes[best].T @ middle, (high - low)[best, :, 0], float(angle[best]))
+    return Rectangle(product(axes[best].T, middle), (high - low)[best, :, 0], float(angle[best]))
 
 
 def are_sides_covered(rectangle: Rectangle, xy: np.ndarray) -> bool:
     """Say whether points (N, 2) follow two sides of a rectangle that meet, each along most of its length."""
-    c, s = np.cos(rectangle.angle), np.sin(rectangle.angle)
-    local = (xy - rectangle.centre) @ np.array([[c, -s], [s, c]])
+    c, s = elementary.cos(rectangle.angle), elementary.sin(rectangle.angle)
+    local = product(xy - rectangle.centre, np.array([[c, -s], [s, c]]))
     is_covered = []
     for across, along in ((0, 1), (1, 0)):
         for sign in (-1.0, 1.0):
@@ -95,12 +104,12 @@ def are_sides_covered(rectangle: Rectangle, xy: np.ndarray) -> bool:
 
 def _fill(cells: np.ndarray, rectangle: Rectangle, *, margin: float, value: int) -> None:
     """Write a value to the cells whose centres lie in a rectangle grown by a margin."""
-    reach = 0.5 * float(np.hypot(*rectangle.sides)) + margin + 1.0
+    reach = 0.5 * float(np.linalg.norm(rectangle.sides, axis=-1)) + margin + 1.0
     x, y = rectangle.centre
     first = [max(0, int(np.floor(v - reach))) for v in (y, x)]
     last = [min(n, int(np.ceil(v + reach)) + 1) for v, n in zip((y, x), cells.shape, strict=True)]
     i, j = np.mgrid[first[0] : last[0], first[1] : last[1]]
-    c, s = np.cos(rectangle.angle), np.sin(rectangle.angle)
+    c, s = elementary.cos(rectangle.angle), elementary.sin(rectangle.angle)
     along, across = (j - x) * c + (i - y) * s, (i - y) * c - (j - x) * s
     half = 0.5 * rectangle.sides + margin
     is_in = (np.abs(along) <= half[0]) & (np.abs(across) <= half[1])

@@ -2,6 +2,9 @@
 
 import numpy as np
 
+from slamcli.geometry import elementary
+from slamcli.geometry.algebra import product
+
 NEAREST_VIEWS = 12  # fewer do not tell
 TURN = np.radians(60.0)  # that the views must span: along a corridor, walls keep their depth, too
 FARTHEST = 1.0  # [m] of a part of the robot
@@ -36,7 +39,7 @@ def fixed_parts(depth: np.ndarray, height: np.ndarray, T_lc: np.ndarray, *, band
 def turned(T_lc: np.ndarray) -> float:
     """Compute the largest angle [rad] between the first view's direction and another's."""
     ahead = T_lc[:, :3, 2]
-    return float(np.arccos(np.clip(ahead @ ahead[0], -1.0, 1.0)).max())
+    return float(elementary.arccos(np.clip(product(ahead, ahead[0]), -1.0, 1.0)).max())
 
 
 def to_pixels(blocks: np.ndarray, shape: tuple[int, int]) -> np.ndarray:

@@ -268,7 +268,7 @@ def _pull_tight(cost: np.ndarray, cells: np.ndarray) -> np.ndarray:
 
 def _line_cost(cost: np.ndarray, a: np.ndarray, b: np.ndarray) -> float:
     """Integrate the cost along the straight line between two cells' centres, sampled four times a cell."""
-    length = float(np.linalg.norm(b - a))
+    length = float(np.linalg.norm(b - a, axis=-1))
     t = np.linspace(0.0, 1.0, int(np.ceil(4.0 * length)) + 1)[:, None]
     cell = np.floor(a + t * (b - a) + 0.5).astype(np.int64)
     value = cost[cell[:, 0], cell[:, 1]]
@@ -279,6 +279,6 @@ def _dense(corners: np.ndarray, spacing: float) -> np.ndarray:
     """Add points so that none is farther than `spacing` from the next; drops repeated ones."""
     parts = [corners[:1]]
     for a, b in zip(corners[:-1], corners[1:], strict=True):
-        n = int(np.ceil(np.linalg.norm(b - a) / spacing))
+        n = int(np.ceil(np.linalg.norm(b - a, axis=-1) / spacing))
         parts.append(a + (b - a) * (np.arange(1, n + 1) / max(n, 1))[:, None])
     return np.concatenate(parts)

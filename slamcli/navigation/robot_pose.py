@@ -7,7 +7,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from slamcli.geometry import se3
+from slamcli.geometry import elementary, se3
+from slamcli.geometry.algebra import product
 
 LOOKS_DOWN = 0.2  # horizontal part of a view below which the picture's upper edge tells the heading, as in the level frame's definition
 OPTICAL_IN_BODY = np.array([[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
@@ -15,8 +16,8 @@ OPTICAL_IN_BODY = np.array([[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -
 
 def planar_pose(T_lc: np.ndarray) -> tuple[float, float, float]:
     """Return x [m], y [m] and heading [rad] on the floor of a camera pose (4, 4), optical frame to level frame."""
-    ahead = T_lc[:2, 2] if np.linalg.norm(T_lc[:2, 2]) >= LOOKS_DOWN else -T_lc[:2, 1]
-    return float(T_lc[0, 3]), float(T_lc[1, 3]), float(np.arctan2(ahead[1], ahead[0]))
+    ahead = T_lc[:2, 2] if np.linalg.norm(T_lc[:2, 2], axis=-1) >= LOOKS_DOWN else -T_lc[:2, 1]
+    return float(T_lc[0, 3]), float(T_lc[1, 3]), float(elementary.arctan2(ahead[1], ahead[0]))
 
 
 def base_in_camera(mount: Sequence[float]) -> np.ndarray:
@@ -30,12 +31,12 @@ def base_in_camera(mount: Sequence[float]) -> np.ndarray:
     for axis, angle in ((2, yaw), (1, pitch), (0, roll)):
         twist = np.zeros(6)
         twist[3 + axis] = angle
-        T_b_body = T_b_body @ se3.exp(twist)
+        T_b_body = product(T_b_body, se3.exp(twist))
     T_b_body[:3, 3] = x, y, z
-    return se3.inverse(T_b_body @ OPTICAL_IN_BODY)
+    return se3.inverse(product(T_b_body, OPTICAL_IN_BODY))
 
 
 def base_pose(T_lc: np.ndarray, T_cb: np.ndarray) -> tuple[float, float, float]:
     """Return x [m], y [m] and heading [rad] on the floor of a robot's base, T_cb (4, 4) base to camera."""
-    T_lb = T_lc @ T_cb
-    return float(T_lb[0, 3]), float(T_lb[1, 3]), float(np.arctan2(T_lb[1, 0], T_lb[0, 0]))
+    T_lb = product(T_lc, T_cb)
+    return float(T_lb[0, 3]), float(T_lb[1, 3]), float(elementary.arctan2(T_lb[1, 0], T_lb[0, 0]))

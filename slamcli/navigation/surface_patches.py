@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from slamcli.geometry import se3
+from slamcli.geometry.algebra import eigh, product
 from slamcli.geometry.camera import Camera
 
 MAX_FRAMES = 256  # key frames kept; of more, every second one goes: bounds memory, and a floor needs no more
@@ -57,7 +58,7 @@ def _patches(depth: np.ndarray, rays: np.ndarray, T_wk: np.ndarray, side: int, m
     normal_k = _normals(blocks)
     rows, columns = np.nonzero(np.isfinite(blocks[..., 2]))
     at = blocks[rows, columns].astype(np.float64)
-    normal_w = normal_k[rows, columns] @ T_wk[:3, :3].T
+    normal_w = se3.rotate(T_wk[:3, :3], normal_k[rows, columns])
     return se3.transform(T_wk, at[:, :3]), normal_w, at[:, 3], np.stack([rows, columns], axis=1).astype(np.int32)
 
 
@@ -110,12 +111,12 @@ def fit_plane(xyz: np.ndarray, weight: np.ndarray, start: np.ndarray, *, rounds:
     """Minimize the weighted sum of distances of points (N, 3) to a plane (4,), [L] (18), by re-weighted least squares."""
     plane = start
     for _ in range(rounds):
-        residual = np.abs(xyz @ plane[:3] + plane[3])
+        residual = np.abs(product(xyz, plane[:3]) + plane[3])
         w = weight / np.maximum(residual, 1e-3)  # sum w r^2 is then the sum of distances, smoothed below 1 mm
         w = w / w.sum()
-        mean = w @ xyz
+        mean = product(w, xyz)
         centred = xyz - mean
-        normal = np.linalg.eigh((centred * w[:, None]).T @ centred)[1][:, 0]
-        normal = normal if normal @ start[:3] > 0.0 else -normal
-        plane = np.append(normal, -normal @ mean)
+        normal = eigh(product((centred * w[:, None]).T, centred))[1][:, 0]
+        normal = normal if product(normal, start[:3]) > 0.0 else -normal
+        plane = np.append(normal, product(-normal, mean))
     return plane

@@ -39,7 +39,7 @@ Record = TypeVar("Record")
 log = logging.getLogger(__name__)
 
 MOST_WARNINGS = 100  # kept in a record and shown; the rest are counted
-PACKAGES = {"numpy": "numpy", "numba": "numba", "opencv": "opencv-python-headless", "open3d": "open3d", "scipy": "scipy"}
+PACKAGES = {"numpy": "numpy", "numba": "numba", "opencv": "opencv-python-headless", "open3d": "open3d", "scipy": "scipy", "g2o": "g2opy"}
 
 
 class Settings:
@@ -173,7 +173,7 @@ class Pipeline:
                 then = state.record.get("environment", {}).get(name, value)
                 if then != value and name != "slamcli":
                     stages.setdefault(then, []).append(state.stage)
-            found += [f"{', '.join(made)} made with {name} {then}, here is {value}" for then, made in stages.items()]
+            found += [f"{', '.join(made)} made with {name} {then}, here is {value}: digits may differ" for then, made in stages.items()]
         return found
 
     # making it hold
@@ -306,7 +306,7 @@ def _plain(value: Any) -> Any:
 @functools.cache
 def environment() -> Mapping[str, str]:
     """Name the versions a result may depend on; they are recorded and shown, and make nothing stale."""
-    found = {"slamcli": __version__, "python": platform.python_version()}
+    found = {"slamcli": __version__, "machine": platform.machine(), "python": platform.python_version()}
     for name, package in PACKAGES.items():
         try:
             found[name] = version(package)

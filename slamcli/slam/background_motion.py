@@ -23,6 +23,7 @@ from slamcli.depth.icp import OrientedPoints, Pass, PosePrior
 from slamcli.estimation import camera_pose, minimal_solvers
 from slamcli.estimation.camera_pose import PoseEstimate
 from slamcli.geometry import se3
+from slamcli.geometry.algebra import product
 from slamcli.geometry.camera import Camera
 from slamcli.schema import Features, Words
 from slamcli.slam import background_motion_kernels as kernels
@@ -103,24 +104,24 @@ class BackgroundMotion:
         if before < reference:
             stamp = self._features.stamp
             share = (stamp[i] - stamp[reference]) / (stamp[reference] - stamp[before])
-            expected = se3.exp(share * se3.log(se3.inverse(T_wc[reference]) @ T_wc[before]))
+            expected = se3.exp(share * se3.log(product(se3.inverse(T_wc[reference]), T_wc[before])))
             tried.append(expected)
         tried += self._sampled(common)
         best = self._best(common, tried, expected, LOOSE, None)
         if expected is None or best.explained < POOR_RATIO * best.contradicted or best.explained < POOR_SHARE:
             around = [se3.exp(np.array([0.0, 0.0, z, 0.0, turn, 0.0])) for z in GRID_M for turn in GRID_RAD]
             start = np.eye(4) if expected is None else expected
-            best = self._best(common, [step @ start for step in around], expected, LOOSE, best)
-        T_wc[i] = T_wc[reference] @ se3.inverse(best.T)
+            best = self._best(common, [product(step, start) for step in around], expected, LOOSE, best)
+        T_wc[i] = product(T_wc[reference], se3.inverse(best.T))
 
     def _place_between(self, T_wc: np.ndarray, first: int, last: int, i: int) -> None:
         """Place a frame between two anchors: near where even motion would have it, refined against the nearer."""
         stamp = self._features.stamp
         share = (stamp[i] - stamp[first]) / (stamp[last] - stamp[first])
         reference = first if share < 0.5 else last
-        expected = se3.inverse(se3.interpolate(T_wc[first], T_wc[last], share)) @ T_wc[reference]
+        expected = product(se3.inverse(se3.interpolate(T_wc[first], T_wc[last], share)), T_wc[reference])
         best = self._best(self._common(reference, i), [expected], expected, TIGHT, None)
-        T_wc[i] = T_wc[reference] @ se3.inverse(best.T)
+        T_wc[i] = product(T_wc[reference], se3.inverse(best.T))
 
     def _best(
         self, common: Common, tried: list[np.ndarray], expected: np.ndarray | None, sigma: np.ndarray, best: Judgement | None
@@ -144,7 +145,7 @@ class BackgroundMotion:
         _, matched = kernels.vote(T[None], *self._votes_of(common, np.arange(len(agrees))), CHI2_AGREE, agrees)
         cost = 0.0
         if expected is not None:
-            swerve = se3.log(T @ se3.inverse(expected))
+            swerve = se3.log(product(T, se3.inverse(expected)))
             cost = min(
                 SWERVE_COST * ((swerve[:3] / SWERVE_M) ** 2).sum() + SWERVE_COST * ((swerve[3:] / SWERVE_RAD) ** 2).sum(), SWERVE_MOST
             )
@@ -154,7 +155,7 @@ class BackgroundMotion:
 
     def _refined(self, common: Common, start: Judgement, sigma: np.ndarray) -> list[np.ndarray]:
         """Refine a motion by the matches that agree with it, and then by depth too."""
-        T, prior, found = start.T, PosePrior(start.T, np.diag(sigma**-2.0)), []
+        T, prior, found = start.T, PosePrior(start.T, np.diag(1.0 / (sigma * sigma))), []
         rows = np.flatnonzero(start.agrees)
         if len(rows) >= LEAST:
             estimate = self._refined_by_matches(T, common, rows)
@@ -210,7 +211,7 @@ class BackgroundMotion:
             xy=np.ascontiguousarray(xy),
             depth=np.ascontiguousarray(depth),
             sigma_px=np.sqrt(2.0) * measured_i.sigma_px[has],
-            sigma_z=np.hypot(measured_r.sigma_z[has], np.nan_to_num(measured_i.sigma_z[has])),
+            sigma_z=np.sqrt(measured_r.sigma_z[has] ** 2 + np.nan_to_num(measured_i.sigma_z[has]) ** 2),
             weight=cell_rad2 * x_r[:, 2] ** 2 / np.maximum(share, 1),
             source=source,
             target=target,
@@ -253,7 +254,7 @@ def _align(T: np.ndarray, source: OrientedPoints, target: OrientedPoints, prior:
     """Move the source's surface onto the target's, all surface counting alike; `prior` as in icp.align."""
     T = np.array(T, dtype=np.float64, order="C")
     H, b = np.zeros((6, 6)), np.zeros(6)
-    pull = prior.information @ se3.log(prior.T @ se3.inverse(T))
+    pull = product(prior.information, se3.log(product(prior.T, se3.inverse(T))))
     icp_kernels.align(
         T, source.xyz, source.normal, _variance(source), target.row, target.xyz, target.normal, _variance(target), target.pinhole,
         SCHEDULE, icp.MIN_COSINE, icp.HUBER_CHI2, icp.READINGS_AS_ONE, np.ascontiguousarray(prior.information), pull, H, b,

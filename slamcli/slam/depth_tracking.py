@@ -12,6 +12,7 @@ from slamcli.depth import icp
 from slamcli.depth.coarse_images import CoarseImages
 from slamcli.depth.icp import Alignment, OrientedPoints, PosePrior
 from slamcli.geometry import se3
+from slamcli.geometry.algebra import product
 from slamcli.geometry.camera import Camera
 from slamcli.parallel import ordered_map
 from slamcli.sparse_map.sparse_map import SparseMap
@@ -93,8 +94,8 @@ class Placement:
 
     def fits(self, T_cw: np.ndarray) -> bool:
         """Say whether another pose of the frame contradicts nothing that depth says."""
-        e = se3.log(T_cw @ se3.inverse(self.T_cw))
-        return bool(e @ self.alignment.information @ e < FIT_CHI2)
+        e = se3.log(product(T_cw, se3.inverse(self.T_cw)))
+        return bool(product(e, self.alignment.information, e) < FIT_CHI2)
 
 
 class DepthAligner:
@@ -113,12 +114,12 @@ class DepthAligner:
         if target is None or source is None:
             return None
         T_wk = self._sparse_map.kf.T_wk[kf]
-        relative = None if prior is None else PosePrior(prior.T @ T_wk, prior.information)
+        relative = None if prior is None else PosePrior(product(prior.T, T_wk), prior.information)
         placement = None
         for T_cw in starts:
-            found = icp.align(T_cw @ T_wk, source, target, prior=relative)
+            found = icp.align(product(T_cw, T_wk), source, target, prior=relative)
             information = found.information + (0.0 if prior is None else prior.information)
-            candidate = Placement(found.T_ij @ se3.inverse(T_wk), kf, found, icp.n_determined(information, found.depth))
+            candidate = Placement(product(found.T_ij, se3.inverse(T_wk)), kf, found, icp.n_determined(information, found.depth))
             if placement is None or candidate.alignment.agreement > placement.alignment.agreement:
                 placement = candidate
             if placement.is_sound:
@@ -175,11 +176,11 @@ class DepthAligner:
         target, source = (self._map_frame_points.of(int(table.frame[kf])) for kf in (kf_i, kf_j))
         if target is None or source is None:
             return None
-        found = icp.align(se3.inverse(table.T_wk[kf_i] @ T_i) @ table.T_wk[kf_j] @ T_j, source, target)
+        found = icp.align(product(se3.inverse(product(table.T_wk[kf_i], T_i)), table.T_wk[kf_j], T_j), source, target)
         if found.agreement < MIN_AGREEMENT or found.overlap < JOIN_OVERLAP or icp.n_determined(found.information, found.depth) < 6:
             return None
         to_depth = se3.adjoint(se3.inverse(T_i))
-        return kf_i, kf_j, T_i @ found.T_ij @ se3.inverse(T_j), to_depth.T @ found.information @ to_depth
+        return kf_i, kf_j, product(T_i, found.T_ij, se3.inverse(T_j)), product(to_depth.T, found.information, to_depth)
 
     def _add(self, edge: tuple[int, int, np.ndarray, np.ndarray] | None) -> bool:
         if edge is not None:
@@ -190,6 +191,6 @@ class DepthAligner:
         """Return the key frames of a segment that stand and look nearly as a camera at T_wc does, nearest first."""
         table = self._sparse_map.kf
         apart = np.linalg.norm(table.T_wk[:, :3, 3] - T_wc[:3, 3], axis=1)
-        cosine = table.T_wk[:, :3, 2] @ T_wc[:3, 2]
+        cosine = product(table.T_wk[:, :3, 2], T_wc[:3, 2])
         near = np.flatnonzero((table.segment == segment) & (apart < JOIN_M) & (cosine > JOIN_COSINE))
         return near[np.argsort(apart[near] + (1.0 - cosine[near]), kind="stable")]

@@ -11,6 +11,7 @@ from slamcli.config.options import SensorConfig, TrackConfig
 from slamcli.estimation.bundle_adjustment import BundleResult
 from slamcli.estimation.camera_pose import PoseEstimate
 from slamcli.geometry import se3
+from slamcli.geometry.algebra import product
 from slamcli.geometry.camera import Camera
 from slamcli.parallel import ordered_map
 from slamcli.schema import KEY_FRAME, LOST, ON_DEPTH, RELOCALIZED, Features, Tracks
@@ -62,17 +63,17 @@ def move_key_frames(sparse_map: SparseMap, tracks: Tracks) -> Tracks:
     """
     table, has_pose = sparse_map.kf, tracks.ref_kf >= 0
     ref, T_wc = tracks.ref_kf[has_pose], np.full(tracks.T_kc.shape, np.nan)
-    T_wc[has_pose] = table.T_wk[ref] @ tracks.T_kc[has_pose]
+    T_wc[has_pose] = product(table.T_wk[ref], tracks.T_kc[has_pose])
     for oldest in np.unique(table.segment, return_index=True)[1]:
-        shift = table.T_wk[oldest] @ se3.inverse(T_wc[table.frame[oldest]])
+        shift = product(table.T_wk[oldest], se3.inverse(T_wc[table.frame[oldest]]))
         is_here = table.segment == table.segment[oldest]
         frames = np.flatnonzero(has_pose)[is_here[ref]]
-        T_wc[frames] = shift @ T_wc[frames]
+        T_wc[frames] = product(shift, T_wc[frames])
         ids = np.flatnonzero(sparse_map.lm.is_alive & is_here[sparse_map.lm.first_kf])
         sparse_map.lm.xyz[ids] = se3.transform(shift, sparse_map.lm.xyz[ids])
     table.T_wk[:] = T_wc[table.frame]
     T_kc = np.full(T_wc.shape, np.nan)
-    T_kc[has_pose] = se3.inverse(table.T_wk[ref]) @ T_wc[has_pose]
+    T_kc[has_pose] = product(se3.inverse(table.T_wk[ref]), T_wc[has_pose])
     T_kc[table.frame] = np.eye(4)
     return replace(tracks, T_kc=T_kc)
 
@@ -123,7 +124,7 @@ class _Refinement:
         self.sparse_map, self.features, self.camera, self.sensor, self.settings = sparse_map, features, camera, sensor, settings
         self.T_wc = np.full(tracks.T_kc.shape, np.nan)  # each in the world of its segment
         has_pose = tracks.ref_kf >= 0
-        self.T_wc[has_pose] = sparse_map.kf.T_wk[tracks.ref_kf[has_pose]] @ tracks.T_kc[has_pose]
+        self.T_wc[has_pose] = product(sparse_map.kf.T_wk[tracks.ref_kf[has_pose]], tracks.T_kc[has_pose])
         self.ref_kf, self.T_kc = tracks.ref_kf.copy(), tracks.T_kc.copy()
         self.state, self.n_inliers = tracks.state.copy(), tracks.n_inliers.copy()
 
@@ -151,7 +152,7 @@ class _Refinement:
         """Note where frame `i` was found, relative to key frame `kf`."""
         self.ref_kf[i], self.n_inliers[i] = kf, estimate.n_inliers
         self.T_wc[i] = se3.inverse(estimate.T_cw)
-        self.T_kc[i] = se3.inverse(estimate.T_cw @ self.sparse_map.kf.T_wk[kf])
+        self.T_kc[i] = se3.inverse(product(estimate.T_cw, self.sparse_map.kf.T_wk[kf]))
 
     def _find(
         self, i: int, T_wc: np.ndarray, landmarks: guided_matching.Landmarks, *, widening: float = 1.0, least: int = 0

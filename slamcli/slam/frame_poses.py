@@ -3,6 +3,7 @@
 import numpy as np
 
 from slamcli.geometry import se3
+from slamcli.geometry.algebra import product
 from slamcli.schema import KEY_FRAME, LOST, Tracks
 from slamcli.sparse_map.sparse_map import SparseMap
 
@@ -48,7 +49,7 @@ class FramePoses:
 
     def T_wc(self, i: int) -> np.ndarray:
         """Compute the pose (4, 4) of a frame that is not lost, under the map as it is now."""
-        return self._kf.T_wk[self.ref_kf[i]] @ self.T_kc[i]
+        return product(self._kf.T_wk[self.ref_kf[i]], self.T_kc[i])
 
     def segment(self, i: int) -> int:
         """Look up the map segment that a frame has its pose in, -1 if it is lost."""
@@ -57,7 +58,7 @@ class FramePoses:
     def attach(self, i: int, kf: int, T_cw: np.ndarray, *, state: int, n_inliers: int, is_anchored: bool = True) -> None:
         """Record the pose of frame `i`, to propagate with key frame `kf`."""
         self.ref_kf[i], self.state[i], self.n_inliers[i], self.latest = kf, state, n_inliers, i
-        self.T_kc[i] = se3.inverse(T_cw @ self._kf.T_wk[kf])
+        self.T_kc[i] = se3.inverse(product(T_cw, self._kf.T_wk[kf]))
         self.anchored = i if is_anchored else self.anchored
         self.lost_reason.pop(i, None)
 
@@ -72,7 +73,7 @@ class FramePoses:
         """
         T_wp = self.T_wc(p)
         if self._background is not None:
-            return se3.inverse(self._background[i]) @ self._background[p] @ se3.inverse(T_wp)
+            return product(se3.inverse(self._background[i]), self._background[p], se3.inverse(T_wp))
         if not self.has_pose(p - 1) or self.segment(p - 1) != self.segment(p):
             return se3.inverse(T_wp)
         share = (self.stamp[i] - self.stamp[p - 1]) / (self.stamp[p] - self.stamp[p - 1])

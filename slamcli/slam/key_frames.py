@@ -6,6 +6,7 @@ import numpy as np
 
 from slamcli.config.options import TrackConfig
 from slamcli.geometry import se3
+from slamcli.geometry.algebra import product
 
 # A frame that shows fewer landmarks with depth, and more other features with depth, sees much that is new and near; as ORB-SLAM2 does
 # (R. Mur-Artal, J. D. Tardos, IEEE T-RO 2017, doi:10.1109/TRO.2017.2705103, III-F, for 1000 features).
@@ -48,12 +49,12 @@ def wants_key_frame_by_depth(T_kc: np.ndarray, overlap: float, settings: TrackCo
     T_kc : (4, 4) frame to its reference key frame; overlap : share of that key frame's depth that it shows
     """
     motion = se3.log(T_kc)
-    has_moved = np.linalg.norm(motion[:3]) > MOVED_M or np.linalg.norm(motion[3:]) > TURNED_RAD
+    has_moved = np.linalg.norm(motion[:3], axis=-1) > MOVED_M or np.linalg.norm(motion[3:], axis=-1) > TURNED_RAD
     return bool(has_moved or overlap < settings.key_frame_share)
 
 
 def count_crowd(T_wk: np.ndarray, T_wc: np.ndarray) -> int:
     """Count the key frames, of poses (K, 4, 4), that stand and look as a camera at `T_wc` does."""
     is_here = np.linalg.norm(T_wk[:, :3, 3] - T_wc[:3, 3], axis=1) < CROWD_M
-    is_here &= T_wk[:, :3, 2] @ T_wc[:3, 2] > CROWD_COSINE
+    is_here &= product(T_wk[:, :3, 2], T_wc[:3, 2]) > CROWD_COSINE
     return int(np.count_nonzero(is_here))

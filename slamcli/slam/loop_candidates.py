@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from slamcli.config.options import LoopConfig
+from slamcli.geometry.algebra import product
 from slamcli.slam.place_recognition import PlaceIndex
 from slamcli.sparse_map.sparse_map import SparseMap
 
@@ -66,7 +67,7 @@ def find_by_pose(sparse_map: SparseMap, places: PlaceIndex, settings: LoopConfig
     for i in range(1, len(sparse_map.kf)):
         is_open = sparse_map.votes(sparse_map.landmarks_of(i))[:i] < settings.min_shared
         is_open &= sparse_map.kf.segment[:i] == sparse_map.kf.segment[i]
-        is_open &= sparse_map.kf.T_wk[:i, :3, 2] @ sparse_map.kf.T_wk[i, :3, 2] > MIN_COSINE
+        is_open &= product(sparse_map.kf.T_wk[:i, :3, 2], sparse_map.kf.T_wk[i, :3, 2]) > MIN_COSINE
         apart = np.where(is_open, np.linalg.norm(spot[:i] - spot[i], axis=1), np.inf)
         j = int(np.argmin(apart))
         if apart[j] < settings.near:

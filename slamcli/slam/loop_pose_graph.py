@@ -7,6 +7,7 @@ import numpy as np
 from slamcli.config.options import LoopConfig
 from slamcli.estimation import pose_graph
 from slamcli.geometry import se3
+from slamcli.geometry.algebra import product
 from slamcli.slam.loop_candidates import Candidate
 from slamcli.sparse_map import map_adjustment
 from slamcli.sparse_map.sparse_map import SparseMap
@@ -32,12 +33,12 @@ class PoseGraph:
 def build(sparse_map: SparseMap, closures: list[Candidate], settings: LoopConfig) -> PoseGraph:
     """Return the edges between covisible key frames, which hold what the map says now, followed by the closures."""
     edge_kf, n_shared = covisibility_edges(sparse_map, settings)
-    T_ij = se3.inverse(sparse_map.kf.T_wk[edge_kf[:, 0]]) @ sparse_map.kf.T_wk[edge_kf[:, 1]]
+    T_ij = product(se3.inverse(sparse_map.kf.T_wk[edge_kf[:, 0]]), sparse_map.kf.T_wk[edge_kf[:, 1]])
     support = np.append(n_shared, [float(min(c.n_inliers, MOST_SUPPORT)) for c in closures])
     return PoseGraph(
         edge_kf=np.concatenate([edge_kf, np.array([(c.kf_i, c.kf_j) for c in closures], dtype=np.int32).reshape(-1, 2)]),
         edge_T_ij=np.concatenate([T_ij, np.array([c.T_ij for c in closures]).reshape(-1, 4, 4)]),
-        information=np.diag(ODOMETRY_SIGMA**-2.0) * (support / UNIT_SUPPORT)[:, None, None],
+        information=np.diag(1.0 / (ODOMETRY_SIGMA * ODOMETRY_SIGMA)) * (support / UNIT_SUPPORT)[:, None, None],
         is_closure=np.arange(len(support)) >= len(edge_kf),
     )
 

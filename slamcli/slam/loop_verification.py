@@ -7,6 +7,7 @@ import numpy as np
 from slamcli.config.options import LoopConfig, SensorConfig
 from slamcli.estimation import camera_pose
 from slamcli.geometry import se3
+from slamcli.geometry.algebra import product
 from slamcli.geometry.camera import Camera
 from slamcli.schema import Words
 from slamcli.slam.loop_candidates import Candidate
@@ -57,7 +58,7 @@ def verify(
     )
     if start is None:
         return candidate.rejected("no rigid motion explains the matches")
-    T_iw = start.T_ba @ se3.inverse(sparse_map.kf.T_wk[candidate.kf_j])
+    T_iw = product(start.T_ba, se3.inverse(sparse_map.kf.T_wk[candidate.kf_j]))
     return _find_landmarks(sparse_map, candidate, frame_i, T_iw, camera, settings)
 
 
@@ -92,4 +93,4 @@ def _find_landmarks(
     candidate = replace(candidate, n_inliers=estimate.n_inliers)
     if estimate.n_inliers < settings.min_inliers:
         return candidate.rejected(f"{estimate.n_inliers} of {settings.min_inliers} landmarks agree")
-    return replace(candidate, T_ij=T_iw @ sparse_map.kf.T_wk[candidate.kf_j])
+    return replace(candidate, T_ij=product(T_iw, sparse_map.kf.T_wk[candidate.kf_j]))

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from slamcli.geometry import se3
+from slamcli.geometry.algebra import product
 from slamcli.slam import loop_pose_graph
 from slamcli.slam.loop_candidates import Candidate
 from slamcli.sparse_map.sparse_map import SparseMap
@@ -44,13 +45,13 @@ def _between(sparse_map: SparseMap, closures: list[Candidate], a: int, b: int) -
     T_wi, T_wj, T_ij = (
         np.array(T) for T in zip(*((sparse_map.kf.T_wk[c.kf_i], sparse_map.kf.T_wk[c.kf_j], c.T_ij) for c in between), strict=True)
     )
-    T_ab = T_wi @ T_ij @ se3.inverse(T_wj)
+    T_ab = product(T_wi, T_ij, se3.inverse(T_wj))
     # residual of closure n under the hypothesis of closure m, (m, n, 6)
-    e = se3.log(se3.inverse(T_wi) @ T_ab[:, None] @ T_wj @ se3.inverse(T_ij))
+    e = se3.log(product(se3.inverse(T_wi), T_ab[:, None], T_wj, se3.inverse(T_ij)))
     agrees = (np.linalg.norm(e[..., :3], axis=-1) < AGREE_M) & (np.linalg.norm(e[..., 3:], axis=-1) < AGREE_RAD)
     weight = np.array([c.n_inliers for c in between])
-    m = int(np.argmax(agrees @ weight))
-    support, rival = int(agrees[m] @ weight), int(((agrees & ~agrees[m]) @ weight)[~agrees[m]].max(initial=0))
+    m = int(np.argmax(product(agrees, weight)))
+    support, rival = int(product(agrees[m], weight)), int((product(agrees & ~agrees[m], weight))[~agrees[m]].max(initial=0))
     if support < OUTWEIGH * rival:
         return None
     return Join(a, b, T_ab[m], [c for c, is_one in zip(here, agrees[m], strict=True) if is_one], support)
@@ -66,6 +67,6 @@ def join(sparse_map: SparseMap, found: Join) -> None:
     """Move segment b, with its landmarks, into the world of a."""
     is_b = sparse_map.kf.segment == found.b
     T_wk = sparse_map.kf.T_wk.copy()
-    T_wk[is_b] = found.T_ab @ T_wk[is_b]
+    T_wk[is_b] = product(found.T_ab, T_wk[is_b])
     loop_pose_graph.move(sparse_map, T_wk)
     sparse_map.kf.segment[is_b] = found.a

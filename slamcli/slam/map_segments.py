@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from slamcli.geometry import se3
+from slamcli.geometry.algebra import product
 from slamcli.schema import Map, Tracks, frame_poses, frame_segments
 
 
@@ -33,7 +34,7 @@ def anchored(map_: Map, tracks: Tracks) -> Map:
             continue
         T_cw = se3.inverse(T_wc[frames[0]])
         kfs, lms = map_.kf_segment == segment, lm_segment == segment
-        T_wk[kfs] = T_cw @ T_wk[kfs]
+        T_wk[kfs] = product(T_cw, T_wk[kfs])
         lm_xyz[lms] = se3.transform(T_cw, lm_xyz[lms])
     return replace(map_, T_wk=T_wk, lm_xyz=lm_xyz)
 

@@ -17,6 +17,7 @@ import numpy as np
 from slamcli.depth import icp
 from slamcli.depth.coarse_images import CoarseImages
 from slamcli.geometry import se3
+from slamcli.geometry.algebra import product
 from slamcli.geometry.camera import Camera
 from slamcli.schema import Features
 from slamcli.slam import moving_object_kernels as kernels
@@ -125,7 +126,7 @@ def _followed(views: Views, frame: int, z: np.ndarray, before: np.ndarray) -> np
     small, _ = icp.coarse_camera(views.camera)
     v, u = (STEP * index + STEP // 2 for index in np.indices(z.shape))
     x = small.backproject(np.stack([u, v], axis=-1).reshape(-1, 2).astype(np.float64), z.ravel())
-    x = se3.transform(se3.inverse(views.T_wc[frame - 1]) @ views.T_wc[frame], x)
+    x = se3.transform(product(se3.inverse(views.T_wc[frame - 1]), views.T_wc[frame]), x)
     with np.errstate(divide="ignore", invalid="ignore"):
         column, row = (np.stack([small.fx * x[:, 0], small.fy * x[:, 1]]) / x[:, 2] + [[small.cx], [small.cy]] + 0.5) // STEP
     inside = (x[:, 2] > 0) & (z.ravel() > 0) & (row >= 0) & (column >= 0) & (row < z.shape[0]) & (column < z.shape[1])
@@ -143,7 +144,7 @@ def weigh(views: Views, frame: int, after: tuple[float, ...]) -> Evidence | None
     place = np.where(row_at < small.width * small.height, row_at, -1).astype(np.int32)
     raw = np.append(views.depth[frame].ravel(), np.uint16(0))
     z = raw[place].astype(np.float32) * np.float32(icp.UNIT)  # -1 takes the 0 at the end
-    T = np.ascontiguousarray(se3.inverse(views.T_wc[others]) @ views.T_wc[frame])
+    T = np.ascontiguousarray(product(se3.inverse(views.T_wc[others]), views.T_wc[frame]))
     pinhole = np.array([small.fx, small.fy, small.cx, small.cy])
     seen = np.zeros((len(others), *shape(views.camera)), dtype=np.uint8)
     images = views.depth.of(others)

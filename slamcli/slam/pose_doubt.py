@@ -10,6 +10,7 @@
 import numpy as np
 
 from slamcli.geometry import se3
+from slamcli.geometry.algebra import product
 from slamcli.schema import ON_DEPTH, Doubt, Map, Tracks, poses_in_segments
 from slamcli.slam import doubt, moving_objects
 from slamcli.slam.doubt import Finding
@@ -91,5 +92,5 @@ def _disagreement(stamp: np.ndarray, first: tuple[Tracks, Map], final: tuple[Tra
     for tracks, map_ in (first, final):
         segment, T_wc = poses_in_segments(tracks, map_)
         T_wc[before[segment != segment[before]]] = np.nan
-        motion.append(se3.inverse(T_wc[before]) @ T_wc)
-    return np.linalg.norm((se3.inverse(motion[0]) @ motion[1])[:, :3, 3], axis=1)
+        motion.append(product(se3.inverse(T_wc[before]), T_wc))
+    return np.linalg.norm(product(se3.inverse(motion[0]), motion[1])[:, :3, 3], axis=1)

@@ -4,6 +4,7 @@ import numpy as np
 
 from slamcli.config.options import SensorConfig, TrackConfig
 from slamcli.geometry import se3
+from slamcli.geometry.algebra import product
 from slamcli.geometry.camera import Camera
 from slamcli.schema import KEY_FRAME, ON_DEPTH, TRACKED, Features, Map, Matches, Tracks, Words
 from slamcli.slam import key_frames
@@ -142,7 +143,7 @@ class Tracker:
         before = np.flatnonzero(segment[:kf] == segment[kf])
         if len(before):
             other = int(before[-1])
-            T_ij = se3.inverse(T_wb[frame[kf]]) @ T_wb[frame[other]]
+            T_ij = product(se3.inverse(T_wb[frame[kf]]), T_wb[frame[other]])
             self._sparse_map.add_edge(kf, other, T_ij, STEADY_INFORMATION)
 
     def _add_previous_as_key_frame(self, i: int) -> int | None:

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import f4, f8, i4, i8, u1, u8
 
+from slamcli.geometry import elementary
 from slamcli.geometry.bits import hamming
 from slamcli.geometry.camera import Camera
 from slamcli.jit.kernel import kernel
@@ -140,9 +141,9 @@ def _search(
     # A landmark is looked for in the octave that it should appear in, rounded; two octaves nearer than ever it still counts as octave 0.
     power, border = np.empty(LAST_OCTAVE + 1), np.empty(LAST_OCTAVE + 4)
     for step in range(LAST_OCTAVE + 1):
-        power[step] = octave_scale**step
+        power[step] = elementary.whole_power(octave_scale, step)
     for step in range(LAST_OCTAVE + 4):
-        border[step] = octave_scale ** (step - 2.5)
+        border[step] = elementary.whole_power(octave_scale, step) / (octave_scale * octave_scale * np.sqrt(octave_scale))
     # In the order of the buckets, what one window needs lies side by side: 0.6 times the time.
     sorted_x, sorted_y, sorted_octave, sorted_desc = np.empty(n), np.empty(n), np.empty(n, np.int64), np.empty((n, 4), np.uint64)
     for position in range(n):

@@ -11,6 +11,7 @@ from slamcli.estimation import bundle_adjustment
 from slamcli.estimation.bundle_adjustment import Observations
 from slamcli.estimation.relative_pose_factors import NO_EDGES, Edges
 from slamcli.geometry import se3
+from slamcli.geometry.algebra import product
 from slamcli.geometry.camera import Camera
 from slamcli.schema import Features
 from slamcli.sparse_map.sparse_map import SparseMap
@@ -129,5 +130,5 @@ def carry(sparse_map: SparseMap, ids: np.ndarray, kfs: np.ndarray, T_wk_before: 
     of = np.searchsorted(kfs, sparse_map.lm.first_kf[ids])
     is_known = (of < len(kfs)) & (kfs[np.minimum(of, len(kfs) - 1)] == sparse_map.lm.first_kf[ids])
     ids, of = ids[is_known], of[is_known]
-    motion = sparse_map.kf.T_wk[kfs] @ se3.inverse(T_wk_before)
+    motion = product(sparse_map.kf.T_wk[kfs], se3.inverse(T_wk_before))
     sparse_map.lm.xyz[ids] = np.einsum("nij,nj->ni", motion[of, :3, :3], sparse_map.lm.xyz[ids]) + motion[of, :3, 3]

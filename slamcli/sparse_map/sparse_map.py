@@ -3,7 +3,7 @@
 import numpy as np
 from numba import b1, f8, i4, i8, u1, u8
 
-from slamcli.geometry import se3
+from slamcli.geometry import elementary, se3
 from slamcli.geometry.bits import hamming
 from slamcli.jit.kernel import kernel
 from slamcli.schema import Features, Map
@@ -70,7 +70,7 @@ class SparseMap:
             xyz=xyz,
             desc=self.desc[rows],
             direction=sight / distance[:, None],
-            reach=distance * self.octave_scale ** self.octave[rows].astype(np.float64),
+            reach=distance * elementary.power(self.octave_scale, self.octave[rows]),
             head=-1,
             n_obs=0,
             n_visible=1,
@@ -386,7 +386,7 @@ def _refresh(
                 sx, sy, sz = sx + dx / distance, sy + dy / distance, sz + dz / distance
                 if distance < nearest:
                     nearest = distance
-                    reach[lm] = distance * octave_scale ** float(octave[obs_row[o]])
+                    reach[lm] = distance * elementary.whole_power(octave_scale, octave[obs_row[o]])
                 rows[n] = obs_row[o]
                 n += 1
             o = next_[o]

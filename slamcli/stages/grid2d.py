@@ -11,6 +11,7 @@ from slamcli.config.options import Config
 from slamcli.depth import icp
 from slamcli.formats import grid_map, octomap
 from slamcli.formats.mask import read_mask
+from slamcli.geometry.algebra import product
 from slamcli.geometry.camera import Camera
 from slamcli.navigation import grid, own_body
 from slamcli.navigation.driven import mark_driven
@@ -37,7 +38,7 @@ def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
         made = grid_from_octree(octomap.read(inputs.path("octree", "map.ot")), settings=cfg.grid2d)
     else:
         made, summary["views"] = _from_depth(inputs, ground.T_lw, cfg, tools)
-    T_lc = ground.T_lw @ frame_poses(inputs.load(Tracks, "loop"), inputs.load(Map, "loop"))
+    T_lc = product(ground.T_lw, frame_poses(inputs.load(Tracks, "loop"), inputs.load(Map, "loop")))
     made = mark_driven(made, T_lc[:, :2, 3], settings=cfg.grid2d)
     counts = {name: int((made.state == state).sum()) for name, state in (("occupied", grid.OCCUPIED), ("free", grid.FREE))}
     if not counts["free"]:
@@ -54,7 +55,7 @@ def _from_depth(inputs: Inputs, T_lw: np.ndarray, cfg: Config, tools: Tools) -> 
     option, camera, moving = cfg.grid2d, inputs.camera("loop"), inputs.load(Moving, "loop")
     rays = np.ascontiguousarray(camera.rays)
     has_depth = np.isfinite(inputs.load(Features, "extract").depth_stamp)
-    poses = [(frame, T_lw @ T_wd) for frame, T_wd in depth_poses(inputs, frames="all") if has_depth[frame]]
+    poses = [(frame, product(T_lw, T_wd)) for frame, T_wd in depth_poses(inputs, frames="all") if has_depth[frame]]
     chosen = grid.spaced(np.array([T_ld for _, T_ld in poses]).reshape(-1, 4, 4), metres=option.spacing, degrees=option.spacing_deg)
 
     is_left_out = _left_out(inputs, [poses[row] for row in chosen.tolist()], cfg, tools)

@@ -12,6 +12,7 @@ from slamcli.dense.occupancy import OccupancyMap, Scan
 from slamcli.depth import oriented_points
 from slamcli.formats import octomap
 from slamcli.geometry import octree, se3
+from slamcli.geometry.algebra import product
 from slamcli.geometry.camera import Camera
 from slamcli.schema import Ground, Moving
 from slamcli.stages.contract import Inputs, Summary, Tools
@@ -52,7 +53,7 @@ def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
 def rounds(inputs: Inputs, grid: OccupancyMap, option: OctreeConfig) -> Iterator[list[PosedFrame]]:
     """Yield the frames to insert, each with its pose (4, 4) camera to level frame: the key frames, then twice those that the map is asked about."""
     T_lw = inputs.load(Ground, "densify").T_lw
-    poses = [(frame, T_lw @ T_wc) for frame, T_wc in depth_poses(inputs, frames="all")]
+    poses = [(frame, product(T_lw, T_wc)) for frame, T_wc in depth_poses(inputs, frames="all")]
     if option.frames == "all":
         yield poses
         return

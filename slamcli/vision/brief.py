@@ -4,8 +4,9 @@ E. Rublee, V. Rabaud, K. Konolige, G. Bradski, ORB: an efficient alternative to 
 """
 
 import numpy as np
-from numba import f4, i4, i8, int16, int32, u1, u4, uint32, uintp
+from numba import f4, f8, i4, i8, int16, int32, u1, u4, uint32, uintp
 
+from slamcli.geometry import elementary
 from slamcli.jit.kernel import kernel
 from slamcli.vision.pattern import PAIRS
 
@@ -69,7 +70,7 @@ def _orient(image: u1[:, ::1], xy: i4[:, ::1], mask: u1[:, ::1], angle: f4[::1])
         for u in range(32):
             m10 += (u - PATCH_RADIUS) * int32(total[u])
             m01 += int32(moment[u])
-        angle[k] = np.arctan2(np.float32(m01), np.float32(m10))
+        angle[k] = elementary.arctangent2(float(m01), float(m10))
 
 
 @kernel
@@ -84,7 +85,7 @@ def _describe(
     row = np.float32(width)  # float32 is exact up to 2^24
     corner = np.float32(BORDER * width + BORDER)  # keeps places positive: negative ones would be tested for and wrapped
     for k in range(len(xy)):
-        cos, sin = np.cos(angle[k]), np.sin(angle[k])
+        cos, sin = np.float32(elementary.cosine(f8(angle[k]))), np.float32(elementary.sine(f8(angle[k])))
         for p in range(512):
             x, y = pair_x[p], pair_y[p]
             place[p] = uint32(((x * sin + y * cos + ROUND) - ROUND) * row + ((x * cos - y * sin + ROUND) - ROUND) + corner)

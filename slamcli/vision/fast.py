@@ -3,12 +3,15 @@
 E. Rosten, T. Drummond, Machine learning for high-speed corner detection, ECCV 2006, doi:10.1007/11744023_34
 """
 
+import functools
 from dataclasses import dataclass
 
 import numpy as np
 from numba import f4, f8, i4, i8, int64, types, u1, u8, uint8, uintp
 from numba.extending import intrinsic
 
+from slamcli.geometry import elementary
+from slamcli.geometry.algebra import product, solve
 from slamcli.jit.kernel import kernel
 from slamcli.vision.pyramid import HEIGHT, TOP, WIDTH, canvas
 
@@ -216,15 +219,14 @@ def _response(image, xy, out):
         out[k] = total
 
 
+@functools.cache
 def _quadratic_fit() -> np.ndarray:
     """Return the (25, 5) weights that turn 5 x 5 values into b_x, b_y, a_xx, a_yy, a_xy of the parabola of least weighted squares."""
     v, u = (axis.ravel() for axis in np.mgrid[-2:3, -2:3].astype(np.float64))
     terms = np.stack([np.ones(25), u, v, 0.5 * u * u, 0.5 * v * v, u * v], axis=1)
-    root = np.exp(-0.25 * (u * u + v * v))  # square root of a Gaussian weight of 1 px
-    return np.ascontiguousarray((np.linalg.pinv(terms * root[:, None]) * root)[1:].T)
-
-
-_FIT = _quadratic_fit()
+    root = elementary.exp(-0.25 * (u * u + v * v))  # square root of a Gaussian weight of 1 px
+    weighted = terms * root[:, None]
+    return np.ascontiguousarray((solve(product(weighted.T, weighted), weighted.T) * root)[1:].T)
 
 
 @kernel
@@ -261,7 +263,7 @@ class Corners:
     def summits(self, rows: np.ndarray) -> np.ndarray:
         """Return the sub-pixel places (N, 2) float64 [px] on the canvas of the chosen corners."""
         out = np.empty((len(rows), 2))
-        _summit(self.score, self.xy.take(rows, axis=0), _FIT, out)
+        _summit(self.score, self.xy.take(rows, axis=0), _quadratic_fit(), out)
         return out
 
 

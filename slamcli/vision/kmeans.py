@@ -8,6 +8,7 @@ from collections.abc import Callable
 import numpy as np
 
 from slamcli.errors import SlamError
+from slamcli.geometry import elementary
 from slamcli.geometry.bits import hamming
 from slamcli.jit.kernel import kernel
 from slamcli.vision.vocabulary import MAX_NODES, Vocabulary, check, quantize
@@ -138,4 +139,4 @@ def document_frequency(vocabulary: Vocabulary, descriptors: list[np.ndarray]) ->
     n_images = np.zeros(vocabulary.n_words, dtype=np.int64)
     for desc in descriptors:
         n_images[np.unique(quantize(vocabulary, desc)[0])] += 1
-    return np.log(len(descriptors) / np.maximum(n_images, 1)).astype(np.float32)
+    return elementary.log(len(descriptors) / np.maximum(n_images, 1)).astype(np.float32)

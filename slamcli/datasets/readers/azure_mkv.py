@@ -10,6 +10,7 @@ from slamcli.datasets.calibration import Calibration
 from slamcli.datasets.recorded import Recorded, Stream
 from slamcli.datasets.video import VideoDepth, VideoFrames, load_av
 from slamcli.errors import SlamError
+from slamcli.geometry.algebra import inverse, product
 
 DEPTH_SCALE = 1000.0
 MAX_ATTACHMENT = 16 << 20  # bytes
@@ -80,7 +81,7 @@ def _calibration(about: dict[str, Any], size: tuple[int, int], depth_size: tuple
         cameras = {str(camera["Purpose"]).rsplit("Purpose", 1)[-1]: camera for camera in about["CalibrationInformation"]["Cameras"]}
         colour, depth = cameras["PhotoVideo"], cameras["Depth"]
         values, depth_values = _intrinsics(colour, size, COLOUR_MODES), _intrinsics(depth, depth_size, DEPTH_MODES)
-        T_cd = _pose(colour) @ np.linalg.inv(_pose(depth))
+        T_cd = product(_pose(colour), inverse(_pose(depth)))
     except (KeyError, TypeError, ValueError, IndexError, np.linalg.LinAlgError) as error:
         raise SlamError(f"{path}: its calibration cannot be used ({type(error).__name__}: {error})") from error
     return Calibration(values, f"{path}: its calibration", depth_values, T_cd)

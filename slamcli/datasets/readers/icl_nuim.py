@@ -12,6 +12,7 @@ from slamcli.datasets.lists import read_pairs
 from slamcli.datasets.readers import associations, numbered
 from slamcli.datasets.recorded import Recorded, truth_when_asked
 from slamcli.formats.trajectory import read_tum
+from slamcli.geometry.algebra import product
 
 # POV-Ray's y axis points up, which the official negative fy makes up for; poses are mirrored instead.
 MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
@@ -42,7 +43,7 @@ def _poses(path: Path, numbers: list[int | None]) -> np.ndarray:
     truth = read_tum(_truth_file(path) or path)
     of = {round(float(stamp)): T_wc for stamp, T_wc in zip(truth.stamp, truth.T_wc, strict=True)}
     unknown = np.full((4, 4), np.nan)
-    return np.array([MIRROR @ of.get(-1 if number is None else number, unknown) @ MIRROR for number in numbers])
+    return np.array([product(MIRROR, of.get(-1 if number is None else number, unknown), MIRROR) for number in numbers])
 
 
 def _truth_file(path: Path) -> Path | None:

@@ -14,6 +14,7 @@ from slamcli.datasets.ros_images import TopicImages
 from slamcli.datasets.sqlite import query
 from slamcli.errors import SlamError
 from slamcli.formats.ros_messages import Cursor, matrix
+from slamcli.geometry.algebra import inverse, product
 
 MARK = "/device_0/sensor_"
 SEARCHED = 1 << 16  # bytes of a bag's list of topics
@@ -52,7 +53,7 @@ def read(path: Path) -> Recorded:
         if T_cr is None or T_dr is None:
             said.append(f"{path}: holds no extrinsics of its streams; the depth camera is taken to be where colour is")
         else:
-            calibration = replace(calibration, T_cd=T_cr @ np.linalg.inv(T_dr))
+            calibration = replace(calibration, T_cd=product(T_cr, inverse(T_dr)))
     return replace(
         found,
         calibration=calibration,

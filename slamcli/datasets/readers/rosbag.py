@@ -12,6 +12,7 @@ from slamcli.datasets.ros_images import COMPRESSED, TopicImages, first_message, 
 from slamcli.errors import SlamError
 from slamcli.formats import ros_messages
 from slamcli.formats.ros_messages import CameraInfo, Image
+from slamcli.geometry.algebra import inverse, product
 
 IMAGE = "sensor_msgs/msg/Image"
 KINDS = (IMAGE, f"sensor_msgs/msg/{COMPRESSED}")
@@ -146,7 +147,7 @@ def _pose(bag: Bag, frame: str, depth_frame: str) -> np.ndarray | None:
                 continue
     colour_chain, depth_chain = _chain(up, frame.strip("/")), _chain(up, depth_frame.strip("/"))
     shared = next((name for name in colour_chain if name in depth_chain), None)
-    return None if shared is None else np.linalg.inv(colour_chain[shared]) @ depth_chain[shared]
+    return None if shared is None else product(inverse(colour_chain[shared]), depth_chain[shared])
 
 
 def _chain(up: dict[str, tuple[str, np.ndarray]], frame: str) -> dict[str, np.ndarray]:
@@ -154,6 +155,6 @@ def _chain(up: dict[str, tuple[str, np.ndarray]], frame: str) -> dict[str, np.nd
     chain = {frame: np.eye(4)}
     while frame in up and up[frame][0] not in chain:
         parent, T = up[frame]
-        chain[parent] = T @ chain[frame]
+        chain[parent] = product(T, chain[frame])
         frame = parent
     return chain

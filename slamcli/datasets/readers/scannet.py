@@ -11,6 +11,7 @@ from slamcli.datasets.intrinsics import read_intrinsics
 from slamcli.datasets.readers import numbered as numbered_reader
 from slamcli.datasets.recorded import Recorded, poses_by_number, read_matrices, truth_when_asked
 from slamcli.errors import SlamError
+from slamcli.geometry.algebra import inverse, product
 
 DEPTH_SCALE = 1000.0
 
@@ -45,7 +46,7 @@ def _calibration(folder: Path) -> Calibration:
 
 def of_two(colour: dict, depth: dict, T_bc: np.ndarray, T_bd: np.ndarray, source: str) -> Calibration:
     """Return the calibration of both cameras, each with its pose on the body; equal ones mean that depth is registered."""
-    T_cd = np.linalg.inv(T_bc) @ T_bd
+    T_cd = product(inverse(T_bc), T_bd)
     keys = ("fx", "fy", "cx", "cy")
     is_same = all(abs(colour[key] - depth[key]) < 1e-6 for key in keys) and np.allclose(T_cd, np.eye(4), atol=1e-9)
     return Calibration(colour, source) if is_same else Calibration(colour, source, depth, T_cd)
