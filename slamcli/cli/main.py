@@ -23,6 +23,7 @@ TOPICS = (
     "maps",
     "render",
     "grid",
+    "plan",
     "floor_plan",
     "visualize",
     "recordings",

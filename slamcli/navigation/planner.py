@@ -11,11 +11,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from slamcli.errors import SlamError
+from slamcli.geometry.heap import doubled, pop, push
 from slamcli.jit.kernel import kernel
+from slamcli.navigation.tight_path import dense, pull_tight
 from slamcli.schema import Grid
 
 HALF_DIAGONAL = 0.5 * 2.0**0.5
-SLACK = 1.01  # a straight stretch may cost this much more than the cells it replaces: rounding alone must not keep a corner
 
 
 @dataclass(frozen=True)
@@ -47,9 +48,9 @@ def plan(
     cells = _cheapest(cost, ends[0], ends[1])
     if cells is None:
         raise SlamError(_unreachable(grid, cost, ends, allow_unknown))
-    corners = _pull_tight(cost, cells)
+    corners = pull_tight(cost, cells)
     xy = (corners[:, ::-1] + 0.5) * float(grid.resolution) + grid.origin
-    xy = _dense(np.concatenate([[start], xy[1:-1], [goal]]) if len(xy) > 1 else np.array([start, goal]), float(grid.resolution))
+    xy = dense(np.concatenate([[start], xy[1:-1], [goal]]) if len(xy) > 1 else np.array([start, goal]), float(grid.resolution))
     rows, columns = _cells_of(grid, xy)
     return Route(xy=xy, clearance=margin[rows, columns], length=float(np.linalg.norm(np.diff(xy, axis=0), axis=1).sum()))
 
@@ -146,40 +147,6 @@ def _unreachable(grid: Grid, cost: np.ndarray, ends: list[tuple[int, int]], allo
 
 
 @kernel
-def _pop(key, order, cell, size):
-    """Take the first entry off a binary heap of `size` entries; its cell is left at cell[size - 1]."""
-    size -= 1
-    first, k, o, c = cell[0], key[size], order[size], cell[size]
-    i = 0
-    while True:
-        child = 2 * i + 1
-        if child >= size:
-            break
-        other = child + 1
-        if other < size and (key[other] < key[child] or (key[other] == key[child] and order[other] < order[child])):
-            child = other
-        if k < key[child] or (k == key[child] and o < order[child]):
-            break
-        key[i], order[i], cell[i] = key[child], order[child], cell[child]
-        i = child
-    key[i], order[i], cell[i] = k, o, c
-    cell[size] = first
-
-
-@kernel
-def _push(key, order, cell, size, k, o, c):
-    """Add an entry to a binary heap of `size` entries; `o` counts the pushes, so that among equal keys the oldest comes first."""
-    i = size
-    while i > 0:
-        parent = (i - 1) // 2
-        if key[parent] <= k:
-            break
-        key[i], order[i], cell[i] = key[parent], order[parent], cell[parent]
-        i = parent
-    key[i], order[i], cell[i] = k, o, c
-
-
-@kernel
 def _a_star(cost, start, goal, before):
     """Fill `before` (H W) with each reached cell's predecessor on its cheapest 8-connected path; returns whether the goal was reached.
 
@@ -191,10 +158,10 @@ def _a_star(cost, start, goal, before):
     done = np.zeros(rows * columns, dtype=np.bool_)
     key, order, cell = np.empty(1024), np.empty(1024, dtype=np.int64), np.empty(1024, dtype=np.int64)
     so_far[start] = 0.0
-    _push(key, order, cell, 0, 0.0, 0, start)
+    push(key, order, cell, 0, 0.0, 0, start)
     size, pushed = 1, 1
     while size > 0:
-        _pop(key, order, cell, size)
+        pop(key, order, cell, size)
         size -= 1
         at = cell[size]
         if done[at]:
@@ -203,7 +170,7 @@ def _a_star(cost, start, goal, before):
         if at == goal:
             return True
         if size + 8 > len(key):
-            key, order, cell = _doubled(key), _doubled(order), _doubled(cell)
+            key, order, cell = doubled(key), doubled(order), doubled(cell)
         r, c = at // columns, at % columns
         for dr in range(-1, 2):
             for dc in range(-1, 2):
@@ -219,18 +186,10 @@ def _a_star(cost, start, goal, before):
                     far, near = abs(goal // columns - r2), abs(goal % columns - c2)
                     if far < near:
                         far, near = near, far
-                    _push(key, order, cell, size, total + far + (diagonal - 1.0) * near, pushed, to)
+                    push(key, order, cell, size, total + far + (diagonal - 1.0) * near, pushed, to)
                     size += 1
                     pushed += 1
     return False
-
-
-@kernel
-def _doubled(values):
-    out = np.empty(2 * len(values), dtype=values.dtype)
-    for i in range(len(values)):
-        out[i] = values[i]
-    return out
 
 
 def _cheapest(cost: np.ndarray, start: tuple[int, int], goal: tuple[int, int]) -> np.ndarray | None:
@@ -244,41 +203,3 @@ def _cheapest(cost: np.ndarray, start: tuple[int, int], goal: tuple[int, int]) -
     while cells[-1] != first:
         cells.append(int(before[cells[-1]]))
     return np.stack(np.divmod(np.array(cells[::-1]), columns), axis=1)
-
-
-def _pull_tight(cost: np.ndarray, cells: np.ndarray) -> np.ndarray:
-    """Keep the cells (M, 2) between which straight stretches cost no more than the path's own."""
-    step = np.linalg.norm(np.diff(cells, axis=0), axis=1)
-    value = cost[cells[:, 0], cells[:, 1]]
-    along = np.concatenate([[0.0], np.cumsum(step * 0.5 * (value[1:] + value[:-1]))])
-
-    def is_as_good(a: int, b: int) -> bool:
-        return _line_cost(cost, cells[a], cells[b]) <= SLACK * (along[b] - along[a])
-
-    kept, at, last = [0], 0, len(cells) - 1
-    while at < last:
-        reach = 1
-        while at + 2 * reach <= last and is_as_good(at, at + 2 * reach):  # doubling keeps the lines tried few
-            reach *= 2
-        candidates = range(min(at + 2 * reach, last), at + reach, -1)
-        at = next((to for to in candidates if is_as_good(at, to)), at + reach)
-        kept.append(at)
-    return cells[kept]
-
-
-def _line_cost(cost: np.ndarray, a: np.ndarray, b: np.ndarray) -> float:
-    """Integrate the cost along the straight line between two cells' centres, sampled four times a cell."""
-    length = float(np.linalg.norm(b - a, axis=-1))
-    t = np.linspace(0.0, 1.0, int(np.ceil(4.0 * length)) + 1)[:, None]
-    cell = np.floor(a + t * (b - a) + 0.5).astype(np.int64)
-    value = cost[cell[:, 0], cell[:, 1]]
-    return float((value.sum() - 0.5 * (value[0] + value[-1])) * length / (len(t) - 1))
-
-
-def _dense(corners: np.ndarray, spacing: float) -> np.ndarray:
-    """Add points so that none is farther than `spacing` from the next; drops repeated ones."""
-    parts = [corners[:1]]
-    for a, b in zip(corners[:-1], corners[1:], strict=True):
-        n = int(np.ceil(np.linalg.norm(b - a, axis=-1) / spacing))
-        parts.append(a + (b - a) * (np.arange(1, n + 1) / max(n, 1))[:, None])
-    return np.concatenate(parts)

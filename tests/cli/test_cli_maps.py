@@ -142,3 +142,16 @@ def test_plans_and_films_are_rendered(slamcli: Callable, known: RunDir, tmp_path
     for tour in ("around", "along"):
         film = slamcli("render", tmp_path / "film.mp4", "--tour", tour, "--seconds", "0.1", "--size", "65", "49", "-r", known.path)
         assert film.exit_code == 0 and "3 frames of 64 x 48 px" in film.stderr
+
+
+def test_what_flies_gets_a_path_through_the_octree(slamcli: Callable, known: RunDir, tmp_path: Path) -> None:
+    result = slamcli(
+        "plan", "--flying", "--start", "first", "--goal", "last", "--radius", "0.1", "-o", tmp_path / "p.json", "-r", known.path
+    )
+    assert result.exit_code == 0, result.stderr
+    rows = np.array([line.split(",") for line in result.stdout.splitlines()[1:]], dtype=float)
+    assert result.stdout.startswith("x,y,z,clearance\n") and rows.shape[1] == 4 and (rows[:, 3] >= 0.0).all()
+    assert json.loads((tmp_path / "p.json").read_text())["points"] == rows[:, :3].tolist()
+    assert slamcli("plan", "--flying", "--start", "1,2", "--goal", "last", "-r", known.path).exit_code == 2
+    assert slamcli("plan", "--start", "1,2,3", "--goal", "last", "-r", known.path).exit_code == 2
+    assert slamcli("plan", "--flying", "--reachable", "--start", "first", "-r", known.path).exit_code == 2

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from slamcli.errors import SlamError
-from slamcli.navigation import planner
+from slamcli.navigation import planner, tight_path
 from slamcli.schema import Grid
 
 RESOLUTION = 0.05
@@ -63,10 +63,10 @@ def test_pulled_tight_the_path_costs_no_more():
     cost = 1.0 + rng.random((40, 40)) ** 4
     cost[20, 5:35] = np.inf
     cells = planner._cheapest(cost, (2, 20), (38, 20))
-    corners = planner._pull_tight(cost, cells)
-    total = sum(planner._line_cost(cost, a, b) for a, b in itertools.pairwise(corners))
-    steps = sum(planner._line_cost(cost, a, b) for a, b in itertools.pairwise(cells))
-    assert total <= planner.SLACK * steps + 1e-9
+    corners = tight_path.pull_tight(cost, cells)
+    total = sum(tight_path.line_cost(cost, a, b) for a, b in itertools.pairwise(corners))
+    steps = sum(tight_path.line_cost(cost, a, b) for a, b in itertools.pairwise(cells))
+    assert total <= tight_path.SLACK * steps + 1e-9
     assert len(corners) < len(cells) / 2
     np.testing.assert_array_equal(corners[[0, -1]], cells[[0, -1]])
 
