@@ -1,6 +1,6 @@
 """The core types. Each is a frozen record of arrays and, saved as a folder of `.npy`, also an artefact's schema.
 
-F frames, M features, P pairs, Q matches, W words, K key frames, L landmarks, O observations, E edges, C closures.
+F frames, M features, P pairs, Q matches, W words, K key frames, L landmarks, O observations, E edges, C closures, R rests.
 v x u blocks of a view, H x W cells of the grid, N poses of a trajectory.
 Missing values: depth and pose NaN, index -1. `offset` columns delimit ragged rows: those of frame i are offset[i]:offset[i+1].
 """
@@ -122,6 +122,13 @@ class Moving:
     """
 
     moving: np.ndarray = array("?", "F v u", "whether what a block shows moves", may_lack=True)
+
+
+@dataclass(frozen=True)
+class Rests:
+    """When the camera stood still, by track: the frames of a rest have one pose, and none between the first and the last is tracked."""
+
+    rest_span: np.ndarray = array("i4", "R 2", "first and last frame of a rest, in order", may_lack=True)
 
 
 @dataclass(frozen=True)

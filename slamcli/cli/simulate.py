@@ -14,6 +14,7 @@ import click
 @click.option("--speed", type=float, help="Top speed [m/s]. [default: 0.6]")
 @click.option("--turn-rate", type=float, help="Top turn rate [rad/s]. [default: 0.8]")
 @click.option("--rate", default=15.0, show_default=True, help="Images per second.")
+@click.option("--rest", default=0.0, show_default=True, help="Seconds of standing still half-way.")
 @click.option("--width", default=640, show_default=True, help="Of the images [px].")
 @click.option("--height", default=480, show_default=True, help="Of the images [px].")
 @click.option("--field-of-view", default=62.7, show_default=True, help="Horizontal field of view [degrees].")
@@ -70,6 +71,6 @@ def simulate(out: Path, frames: int | None, speed: float | None, turn_rate: floa
     if turn_rate is not None:
         settings["turn_rate"] = turn_rate
     if frames is None and speed is None and turn_rate is None and settings["trajectory"] is None:
-        frames = 360
+        frames = 360 + round(settings["rest"] * settings["rate"])
     render(out, progress=console.progress, frames=frames, alias=alias or "", **settings)
     click.echo(out)

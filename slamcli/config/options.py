@@ -165,6 +165,7 @@ class TrackConfig:
     depth_icp_below: int = option(150, "with fewer landmarks, a frame is aligned by its depth image; 0 = without any", ge=0)
     depth_icp_hold: float = option(1.0, "how long motion continues in directions that depth leaves open, as along a wall [s]", ge=0, le=10)
     moving_objects: bool = option(True, "find what moves, such as people; poses and maps rest on what stands still")
+    rests: bool = option(True, "find where the camera stands still: one pose, no key frames")
     share_key_frames: int = option(10, "neighbours in which a new key frame's landmarks are looked for", ge=0)
     share_max_distance: int = option(50, "descriptors that differ more are not one landmark [bits]", ge=1, le=256)
     window_key_frames: int = option(12, "key frames adjusted with each new one", ge=2)

@@ -43,6 +43,7 @@ class Simulation:
     speed: float = 0.6  # [m/s], at most
     turn_rate: float = 0.8  # [rad/s], at most
     rate: float = 15.0  # [Hz]
+    rest: float = 0.0  # [s] of standing still half-way, not with a trajectory
     width: int = 640
     height: int = 480
     field_of_view: float = 62.7  # horizontal
@@ -104,7 +105,7 @@ def build(what: Simulation) -> tuple[Scene, Motion]:
     rng = np.random.default_rng([what.seed, 2])
     path = drive.closed_path(low, high, margin, rng)
     motion = drive.rounds(path, frames=what.frames, speed=what.speed, turn_rate=what.turn_rate, rate=what.rate, laps=what.laps,
-                          height=what.camera_height, pitch=np.radians(what.pitch), rng=rng)  # fmt: skip
+                          height=what.camera_height, pitch=np.radians(what.pitch), rng=rng, rest=what.rest)  # fmt: skip
     if what.alias == "corridor":
         return room.corridor(low, high, seed=what.seed), motion
     centres = np.column_stack([path, np.zeros(len(path))])  # the robot itself is on the floor
@@ -150,7 +151,7 @@ def _read_stamps(path: Path) -> np.ndarray:
 
 def _check(what: Simulation) -> None:
     bounds = {
-        "frames": (1, 1_000_000), "laps": (0.01, 1000), "speed": (0.001, 100), "turn_rate": (0.001, 100), "rate": (0.1, 1000),
+        "frames": (1, 1_000_000), "laps": (0.01, 1000), "speed": (0.001, 100), "turn_rate": (0.001, 100), "rate": (0.1, 1000), "rest": (0, 3600),
         "width": (32, 4096), "height": (32, 4096), "field_of_view": (20, 120), "camera_height": (0.1, 2.4), "pitch": (-80, 80),
         "depth_min": (0, 10), "depth_max": (0.1, 13), "textured": (0, 1), "holes": (0, 1), "seed": (0, 2**31), "people": (0, MOST_PEOPLE),
     }  # fmt: skip

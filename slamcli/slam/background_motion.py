@@ -38,7 +38,9 @@ REFINED = 3  # best motions that are refined
 LEAST = 10  # matches that a refinement needs
 MAX_DISTANCE, RATIO = 64, 0.85  # of descriptors, as in the match stage, a little looser: frames lie farther apart
 FLATNESS = np.array([0.015, 0.006])  # [m, 1/m] distance between surfaces that are the same, and its growth with (z - 0.4)^2
-SWERVE_M, SWERVE_RAD, SWERVE_COST, SWERVE_MOST = 0.08, 0.08, 0.1, 0.3  # change of motion that costs so much of the surface, and at most
+SWERVE_M, SWERVE_RAD = 0.08, 0.08  # [m, rad] by which the motion from anchor to anchor changes now and then
+SWERVE_COST, SWERVE_MOST = 0.1, 3.0  # share of the surface that such a change is worth, and how many of them at most
+CANDIDATES, ALIKE = 6, 0.01  # motions kept of each step, and the swerve up to which two are one
 LOOSE = np.array([0.02] * 3 + [0.01] * 3)  # [m, rad] how far ICP may go where no match holds it
 TIGHT = np.array([0.007] * 3 + [0.004] * 3)  # of frames between anchors, whose place is nearly known
 POOR_SHARE, POOR_RATIO = 0.4, 10.0  # surface explained, and how many times what contradicts, below which the grid is searched too
@@ -87,32 +89,51 @@ class BackgroundMotion:
         self._pinhole = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
         self._frame_points: OrderedDict[int, OrientedPoints] = OrderedDict()
 
-    def poses(self, progress: Callable[[range], Iterable[int]] = iter) -> np.ndarray:
-        """Estimate T_wc (F, 4, 4) of all frames, the first at the origin; local motion is right, drift adds up."""
+    def poses(self, progress: Callable[[range], Iterable[int]] = iter, *, before: np.ndarray | None = None) -> np.ndarray:
+        """Estimate T_wc (F, 4, 4) of all frames, the first at the origin; local motion is right, drift adds up.
+
+        before : what an earlier round estimated, whose motions are tried too
+        """
         stamp = self._features.stamp
         anchors = anchor_frames(stamp)
-        T_wc = np.tile(np.eye(4), (len(stamp), 1, 1))
+        steps, scale = list[list[Judgement]](), list[float]()
         for k in progress(range(1, len(anchors))):
-            self._place_anchor(T_wc, anchors[max(k - 2, 0)], anchors[k - 1], anchors[k])
+            reference, i = anchors[k - 1], anchors[k]
+            scale.append((stamp[i] - stamp[reference]) / (stamp[reference] - stamp[anchors[k - 2]]) if k > 1 else 1.0)
+            tried = [np.eye(4)]
+            if before is not None:
+                tried.append(_motion(before, reference, i))
+                if k + 1 < len(anchors):  # as if the motion after it had been the same
+                    tried.append(
+                        _scaled(_motion(before, i, anchors[k + 1]), (stamp[i] - stamp[reference]) / (stamp[anchors[k + 1]] - stamp[i]))
+                    )
+            expected = [_scaled(one.T, scale[-1]) for one in steps[-1]] if steps else []
+            steps.append(self._candidates(reference, i, tried, expected))
+        T_wc = np.tile(np.eye(4), (len(stamp), 1, 1))
+        for k, T in enumerate(_steadiest(steps, scale), start=1):
+            T_wc[anchors[k]] = product(T_wc[anchors[k - 1]], se3.inverse(T))
+        for k in progress(range(1, len(anchors))):
             for i in range(anchors[k - 1] + 1, anchors[k]):
                 self._place_between(T_wc, anchors[k - 1], anchors[k], i)
         return T_wc
 
-    def _place_anchor(self, T_wc: np.ndarray, before: int, reference: int, i: int) -> None:
-        """Place an anchor against the one before; the motion between that and an earlier one says what to expect."""
-        common, expected, tried = self._common(reference, i), None, [np.eye(4)]
-        if before < reference:
-            stamp = self._features.stamp
-            share = (stamp[i] - stamp[reference]) / (stamp[reference] - stamp[before])
-            expected = se3.exp(share * se3.log(product(se3.inverse(T_wc[reference]), T_wc[before])))
-            tried.append(expected)
-        tried += self._sampled(common)
-        best = self._best(common, tried, expected, LOOSE, None)
-        if expected is None or best.explained < POOR_RATIO * best.contradicted or best.explained < POOR_SHARE:
+    def _candidates(self, reference: int, i: int, tried: list[np.ndarray], expected: list[np.ndarray]) -> list[Judgement]:
+        """Find the motions from one anchor to the next for which most speaks, each unlike the others, the best first.
+
+        expected : as the motion before would have it, of each of its candidates
+        """
+        common = self._common(reference, i)
+        found = self._refine_best(common, [*tried, *expected, *self._sampled(common)], LOOSE)
+        best = max(found, key=lambda one: one.score)
+        if not expected or best.explained < POOR_RATIO * best.contradicted or best.explained < POOR_SHARE:
             around = [se3.exp(np.array([0.0, 0.0, z, 0.0, turn, 0.0])) for z in GRID_M for turn in GRID_RAD]
-            start = np.eye(4) if expected is None else expected
-            best = self._best(common, [product(step, start) for step in around], expected, LOOSE, best)
-        T_wc[i] = product(T_wc[reference], se3.inverse(best.T))
+            start = expected[0] if expected else np.eye(4)
+            found += self._refine_best(common, [product(step, start) for step in around], LOOSE)
+        kept: list[Judgement] = []
+        for one in sorted(found, key=lambda one: -one.score):
+            if len(kept) < CANDIDATES and all(_swerve(one.T, other.T) > ALIKE for other in kept):
+                kept.append(one)
+        return kept
 
     def _place_between(self, T_wc: np.ndarray, first: int, last: int, i: int) -> None:
         """Place a frame between two anchors: near where even motion would have it, refined against the nearer."""
@@ -120,22 +141,17 @@ class BackgroundMotion:
         share = (stamp[i] - stamp[first]) / (stamp[last] - stamp[first])
         reference = first if share < 0.5 else last
         expected = product(se3.inverse(se3.interpolate(T_wc[first], T_wc[last], share)), T_wc[reference])
-        best = self._best(self._common(reference, i), [expected], expected, TIGHT, None)
+        judged = self._refine_best(self._common(reference, i), [expected], TIGHT)
+        best = max(judged, key=lambda one: one.score - SWERVE_COST * min(_swerve(one.T, expected), SWERVE_MOST))
         T_wc[i] = product(T_wc[reference], se3.inverse(best.T))
 
-    def _best(
-        self, common: Common, tried: list[np.ndarray], expected: np.ndarray | None, sigma: np.ndarray, best: Judgement | None
-    ) -> Judgement:
-        """Judge motions, refine the most promising, and return the best of them and of `best`."""
-        judged = sorted((self._judge(common, T, expected) for T in tried), key=lambda judgement: -judgement.score)
-        for start in judged[:REFINED]:
-            for refined in (start, *(self._judge(common, T, expected) for T in self._refined(common, start, sigma))):
-                if best is None or refined.score > best.score:
-                    best = refined
-        assert best is not None
-        return best
+    def _refine_best(self, common: Common, tried: list[np.ndarray], sigma: np.ndarray) -> list[Judgement]:
+        """Judge motions and refine the most promising; returns all that were judged."""
+        judged = [self._judge(common, T) for T in tried]
+        best = sorted(judged, key=lambda judgement: -judgement.score)[:REFINED]
+        return judged + [self._judge(common, T) for start in best for T in self._refined(common, start, sigma)]
 
-    def _judge(self, common: Common, T: np.ndarray, expected: np.ndarray | None) -> Judgement:
+    def _judge(self, common: Common, T: np.ndarray) -> Judgement:
         """Judge a motion by both frames: a surface that comes nearer hides its old place from the one and is looked through by the other."""
         T = np.ascontiguousarray(T)
         there = _explain(T, common.source, common.target)
@@ -143,15 +159,8 @@ class BackgroundMotion:
         explained, contradicted = (0.5 * (one + other) for one, other in zip(there, back, strict=True))
         agrees = np.zeros(len(common.weight), dtype=np.bool_)
         _, matched = kernels.vote(T[None], *self._votes_of(common, np.arange(len(agrees))), CHI2_AGREE, agrees)
-        cost = 0.0
-        if expected is not None:
-            swerve = se3.log(product(T, se3.inverse(expected)))
-            cost = min(
-                SWERVE_COST * ((swerve[:3] / SWERVE_M) ** 2).sum() + SWERVE_COST * ((swerve[3:] / SWERVE_RAD) ** 2).sum(), SWERVE_MOST
-            )
         surface = max(common.surface, 1e-9)
-        score = (explained - contradicted + matched) / surface - cost
-        return Judgement(T, score, explained / surface, contradicted / surface, agrees)
+        return Judgement(T, (explained - contradicted + matched) / surface, explained / surface, contradicted / surface, agrees)
 
     def _refined(self, common: Common, start: Judgement, sigma: np.ndarray) -> list[np.ndarray]:
         """Refine a motion by the matches that agree with it, and then by depth too."""
@@ -235,6 +244,40 @@ class BackgroundMotion:
             if len(self._frame_points) > KEPT:
                 self._frame_points.popitem(last=False)
         return self._frame_points[frame]
+
+
+def _motion(T_wc: np.ndarray, reference: int, i: int) -> np.ndarray:
+    """Return the motion T_ir from a reference to frame i."""
+    return product(se3.inverse(T_wc[i]), T_wc[reference])
+
+
+def _scaled(T: np.ndarray, share: float) -> np.ndarray:
+    """Return a share of a motion."""
+    return se3.exp(share * se3.log(T))
+
+
+def _swerve(T: np.ndarray, expected: np.ndarray) -> float:
+    """Measure by how much a motion differs from another: 1 for a change by SWERVE_M or SWERVE_RAD, 4 for twice as much."""
+    e = se3.log(product(T, se3.inverse(expected)))
+    return float(((e[:3] / SWERVE_M) ** 2).sum() + ((e[3:] / SWERVE_RAD) ** 2).sum())
+
+
+def _steadiest(steps: list[list[Judgement]], scale: list[float]) -> list[np.ndarray]:
+    """Choose one candidate of each step, so that most speaks for all of them together and the motion changes least (R. Bellman, 1957).
+
+    scale : how long each step lasts, in times of the one before. One wrong step alone would lead all those after it astray, as what is
+    expected of them.
+    """
+    total, came_from = [np.array([one.score for one in candidates]) for candidates in steps], list[np.ndarray]()
+    for k in range(1, len(steps)):
+        cost = np.array([[min(_swerve(one.T, _scaled(other.T, scale[k])), SWERVE_MOST) for other in steps[k - 1]] for one in steps[k]])
+        through = total[k - 1][None, :] - SWERVE_COST * cost
+        came_from.append(through.argmax(axis=1))
+        total[k] = total[k] + through.max(axis=1)
+    chosen = [int(total[-1].argmax())] if steps else []
+    for origin in reversed(came_from):
+        chosen.append(int(origin[chosen[-1]]))
+    return [candidates[number].T for candidates, number in zip(steps, reversed(chosen), strict=True)]
 
 
 def anchor_frames(stamp: np.ndarray) -> list[int]:

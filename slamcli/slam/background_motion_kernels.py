@@ -18,6 +18,7 @@ def vote(
 ):  # fmt: skip
     """Find the motion T (M, 3 or 4, 4) with which matches of the greatest total weight agree; write these; return its number and the weight.
 
+    The better a match agrees, the more of its weight counts (P. Torr, A. Zisserman, CVIU 2000, doi:10.1006/cviu.1999.0832).
     Point x_r[i] is to be seen at xy[i] in depth[i], NaN = unknown. A motion that is not finite has no votes; -1 where none is.
     """
     best, most = -1, -1.0
@@ -30,8 +31,9 @@ def vote(
             if total + left <= most:
                 break
             left -= weight[i]
-            if _misfit(T[h], x_r, xy, depth, inv_px, inv_z, i, pinhole) < chi2:
-                total += weight[i]
+            misfit = _misfit(T[h], x_r, xy, depth, inv_px, inv_z, i, pinhole)
+            if misfit < chi2:
+                total += weight[i] * (1.0 - misfit / chi2)
         if total > most:
             best, most = h, total
     if best >= 0:

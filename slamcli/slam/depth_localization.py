@@ -8,6 +8,7 @@ import numpy as np
 from slamcli.config.options import TrackConfig
 from slamcli.depth.icp import PosePrior
 from slamcli.geometry import se3
+from slamcli.slam import background_prior
 from slamcli.slam.depth_tracking import DepthAligner, Placement
 from slamcli.slam.frame_poses import STEADY_INFORMATION, FramePoses
 from slamcli.slam.local_map import LocalMap, MapMatch
@@ -48,6 +49,7 @@ class DepthLocalizer:
         """
         self._sparse_map, self._poses, self._aligner, self._local_map = sparse_map, poses, aligner, local_map
         self._settings, self._make_reference = settings, make_reference
+        self._steady = background_prior.BETWEEN_FRAMES if poses.has_background else STEADY_INFORMATION
 
     def locate(self, i: int, frame: FrameFeatures, found: MapMatch | None) -> DepthMatch | None:
         """Align frame `i` with the reference key frame of the frame before it, together with what landmarks there are.
@@ -67,7 +69,7 @@ class DepthLocalizer:
             poses.lost_reason[i] = f"the depth shows {placed.n_determined} of 6 directions only: a flat wall"
             if found is not None or stamp[i] - stamp[poses.anchored] > self._settings.depth_icp_hold:
                 return None
-            placed = self._aligner.place(i, placed.kf, [expected], PosePrior(expected, STEADY_INFORMATION))
+            placed = self._aligner.place(i, placed.kf, [expected], PosePrior(expected, self._steady))
             if placed is None or not placed.is_sound:
                 return None
         few = self._match_few(frame, placed)
@@ -107,7 +109,7 @@ class DepthLocalizer:
 
         starts : T_cw, the first as expected, which counts as measured where the background's motion says so
         """
-        placed = self._aligner.place(i, kf, starts, PosePrior(starts[0], STEADY_INFORMATION) if self._poses.has_background else None)
+        placed = self._aligner.place(i, kf, starts, PosePrior(starts[0], self._steady) if self._poses.has_background else None)
         if placed is not None and placed.is_sound and placed.n_determined < 6:
             few = self._match_few(frame, placed)
             if few is not None:

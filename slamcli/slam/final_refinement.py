@@ -14,7 +14,8 @@ from slamcli.geometry import se3
 from slamcli.geometry.algebra import product
 from slamcli.geometry.camera import Camera
 from slamcli.parallel import ordered_map
-from slamcli.schema import KEY_FRAME, LOST, ON_DEPTH, RELOCALIZED, Features, Tracks
+from slamcli.schema import KEY_FRAME, LOST, ON_DEPTH, RELOCALIZED, Features, Rests, Tracks
+from slamcli.slam import rests
 from slamcli.slam.depth_tracking import DepthAligner, FramePoints
 from slamcli.sparse_map import guided_matching, map_adjustment
 from slamcli.sparse_map.frame import frame_features, refine_on_landmarks
@@ -38,12 +39,14 @@ def refine_all(
     iterations: int,
     progress,
     workers: int = 1,
+    stands_still: Rests = rests.NONE,
 ) -> tuple[Tracks, BundleResult | None]:
     """Align each key frame's depth image with those of up to `depth_icp_edges` covisible ones, adjust the map, refine every frame against it.
 
     sparse_map : its map is changed; its features are those that `sensing` corrected
     frame_points : of the recording, of which depth images are taken; depth_icp_weight : factor on what they say in the adjustment
     workers : threads; the result is the same with any number
+    stands_still : when the camera does: the frames of a rest get one pose
     Returns the refined tracks, and the evidence of the adjustment, None where nothing ties two key frames together.
     """
     if depth_icp_edges:
@@ -52,7 +55,9 @@ def refine_all(
         DepthAligner(sparse_map, frame_points, frame_points).join_covisible(T_cd, most=depth_icp_edges, least=SHARED, workers=workers)
     kfs = np.arange(len(sparse_map.kf), dtype=np.int32)
     result = map_adjustment.adjust(sparse_map, kfs, sensing.camera, sensor, max_iterations=iterations, edge_weight=depth_icp_weight)
-    tracks = refine_frames(sparse_map, sparse_map.features, tracks, sensing.camera, sensor, settings, progress, workers=workers)
+    tracks = refine_frames(
+        sparse_map, sparse_map.features, tracks, sensing.camera, sensor, settings, progress, workers=workers, stands_still=stands_still
+    )
     return move_key_frames(sparse_map, tracks), result
 
 
@@ -88,23 +93,26 @@ def refine_frames(
     progress,
     *,
     workers: int = 1,
+    stands_still: Rests = rests.NONE,
 ) -> Tracks:
     """Refine every frame against the landmarks around it; lost ones are tried from both sides.
 
     features, tracks : of the frames, which may be of another recording than the map; workers : threads
+    stands_still : when the camera does: the frames of a rest get one pose, of as many as that takes
     A frame keeps its pose where much fewer landmarks agree than before, and a key frame also where so few do that depth held it.
     Returns new Tracks; the map stays as it is.
     """
     refinement = _Refinement(sparse_map, features, tracks, camera, sensor, settings)
     n = len(tracks.state)
     # The few landmarks around a frame on shape would make its pose worse.
-    chosen = np.flatnonzero((tracks.state != LOST) & (tracks.state != ON_DEPTH))
+    chosen = np.flatnonzero((tracks.state != LOST) & (tracks.state != ON_DEPTH) & ~rests.left_out(stands_still, n))
     # No frame depends on another; those that follow one another on one key frame share the landmarks around it.
     spans = np.split(chosen, np.flatnonzero(np.diff(tracks.ref_kf[chosen])) + 1)
     refined = ordered_map(refinement.again, spans, workers=workers)
     for i, estimate in progress(chain.from_iterable(refined), "final refinement", len(chosen)):
         if estimate is not None:
             refinement.record(i, int(tracks.ref_kf[i]), estimate)
+            refinement.is_measured[i] = True
     for order, step in ((range(n), -1), (range(n - 1, -1, -1), 1)):
         for i in order:  # a lost frame begins where its neighbour in time stands
             j = i + step
@@ -112,6 +120,7 @@ def refine_frames(
             if is_open and refinement.place(i, refinement.T_wc[j], int(refinement.ref_kf[j]), widening=LOST_WIDENING):
                 refinement.place(i, refinement.T_wc[i], int(refinement.ref_kf[i]))
                 refinement.state[i] = RELOCALIZED
+    refinement.rest(stands_still)
     return Tracks(ref_kf=refinement.ref_kf, T_kc=refinement.T_kc, state=refinement.state, n_inliers=refinement.n_inliers)
 
 
@@ -127,6 +136,7 @@ class _Refinement:
         self.T_wc[has_pose] = product(sparse_map.kf.T_wk[tracks.ref_kf[has_pose]], tracks.T_kc[has_pose])
         self.ref_kf, self.T_kc = tracks.ref_kf.copy(), tracks.T_kc.copy()
         self.state, self.n_inliers = tracks.state.copy(), tracks.n_inliers.copy()
+        self.is_measured = np.zeros(len(tracks.state), dtype=bool)
 
     def again(self, span: np.ndarray) -> list[tuple[int, PoseEstimate | None]]:
         """Look for frames that stand on one key frame where they stand; returns each with its pose, None if it is not there."""
@@ -153,6 +163,15 @@ class _Refinement:
         self.ref_kf[i], self.n_inliers[i] = kf, estimate.n_inliers
         self.T_wc[i] = se3.inverse(estimate.T_cw)
         self.T_kc[i] = se3.inverse(product(estimate.T_cw, self.sparse_map.kf.T_wk[kf]))
+
+    def rest(self, stands_still: Rests) -> None:
+        """Give the frames of each rest one pose."""
+        has_pose = self.ref_kf >= 0
+        segment = np.where(has_pose, self.sparse_map.kf.segment[self.ref_kf], -1)
+        T_wc = rests.one_pose(stands_still, self.T_wc, self.is_measured, segment)
+        moved = np.flatnonzero(has_pose & (T_wc != self.T_wc).any(axis=(1, 2)))
+        self.T_wc[moved] = T_wc[moved]
+        self.T_kc[moved] = product(se3.inverse(self.sparse_map.kf.T_wk[self.ref_kf[moved]]), T_wc[moved])
 
     def _find(
         self, i: int, T_wc: np.ndarray, landmarks: guided_matching.Landmarks, *, widening: float = 1.0, least: int = 0

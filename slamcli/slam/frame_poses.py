@@ -4,7 +4,7 @@ import numpy as np
 
 from slamcli.geometry import se3
 from slamcli.geometry.algebra import product
-from slamcli.schema import KEY_FRAME, LOST, Tracks
+from slamcli.schema import KEY_FRAME, LOST, ON_DEPTH, TRACKED, Tracks
 from slamcli.sparse_map.sparse_map import SparseMap
 
 # [1/m^2, 1/rad^2] of a motion that goes on as before, or that the background shows: known within 10 mm and 0.6 degrees.
@@ -61,6 +61,13 @@ class FramePoses:
         self.T_kc[i] = se3.inverse(product(T_cw, self._kf.T_wk[kf]))
         self.anchored = i if is_anchored else self.anchored
         self.lost_reason.pop(i, None)
+
+    def stay(self, i: int) -> None:
+        """Record that frame `i` was taken where the one before it was."""
+        before = i - 1
+        self.ref_kf[i], self.T_kc[i], self.n_inliers[i], self.latest = self.ref_kf[before], self.T_kc[before], self.n_inliers[before], i
+        self.state[i] = ON_DEPTH if self.state[before] == ON_DEPTH else TRACKED
+        self.anchored = i if self.anchored == before else self.anchored
 
     def make_key_frame(self, i: int, kf: int) -> None:
         """Record that frame `i` is key frame `kf` itself."""

@@ -8,7 +8,7 @@ import numpy as np
 from slamcli.config.options import SensorConfig, TrackConfig
 from slamcli.geometry.camera import Camera
 from slamcli.schema import ON_DEPTH, RELOCALIZED, TRACKED, Features, Matches, Tracks, Words
-from slamcli.slam import initial_pose
+from slamcli.slam import background_prior, initial_pose
 from slamcli.slam.depth_localization import DepthLocalizer, DepthMatch
 from slamcli.slam.depth_tracking import NO_FRAME_POINTS, DepthAligner, FramePoints, Placement
 from slamcli.slam.frame_poses import FramePoses
@@ -87,9 +87,12 @@ class Localizer:
     def locate(self, i: int, frame: FrameFeatures) -> Location | None:
         """Find the pose of frame `i` and record it; None, and the reason recorded, where it is lost.
 
-        By the landmarks that the frame before it saw; by depth ICP where these are few; by a key frame that looks alike where both fail.
+        By the landmarks that the frame before it saw; by depth ICP where these are few; by a key frame that looks alike where both fail;
+        by the background's motion, where that is known and nothing else holds the frame.
         """
         found = self._follow(i, frame)
+        if found is not None and self.poses.has_background:
+            found = background_prior.reconcile(found, self.poses.predict(i, i - 1))
         if found is None or found.estimate.n_inliers < self._settings.depth_icp_below:
             by_depth = self._by_depth.locate(i, frame, found)
             if by_depth is not None:
@@ -99,6 +102,8 @@ class Localizer:
         found = self._relocalize(i, frame)
         if found is not None:
             return self._record(i, found, RELOCALIZED)
+        if self.poses.has_background and self.poses.has_pose(i - 1):
+            return self._record_by_background(i, frame)
         self.poses.lost_reason.setdefault(i, self._why_lost(frame))
         return None
 
@@ -120,6 +125,12 @@ class Localizer:
         ids = self._sparse_map.resolve(ids)
         ids = ids[ids >= 0]
         return ids if len(ids) else self._sparse_map.landmarks_of(int(self.poses.ref_kf[i - 1]))
+
+    def _record_by_background(self, i: int, frame: FrameFeatures) -> Location:
+        """Place frame `i` where the background's motion takes the frame before it: no landmark holds it."""
+        kf = int(self.poses.ref_kf[i - 1])
+        self.poses.attach(i, kf, self.poses.predict(i, i - 1), state=ON_DEPTH, n_inliers=0, is_anchored=False)
+        return Location(nothing_seen(frame), None)
 
     def _relocalize(self, i: int, frame: FrameFeatures) -> MapMatch | None:
         """Find frame `i` by a key frame that looks alike, wherever it is; None where none does."""

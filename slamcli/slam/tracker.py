@@ -6,10 +6,9 @@ from slamcli.config.options import SensorConfig, TrackConfig
 from slamcli.geometry import se3
 from slamcli.geometry.algebra import product
 from slamcli.geometry.camera import Camera
-from slamcli.schema import KEY_FRAME, ON_DEPTH, TRACKED, Features, Map, Matches, Tracks, Words
-from slamcli.slam import key_frames
+from slamcli.schema import KEY_FRAME, ON_DEPTH, TRACKED, Features, Map, Matches, Rests, Tracks, Words
+from slamcli.slam import background_prior, key_frames, rests
 from slamcli.slam.depth_tracking import NO_FRAME_POINTS, FramePoints, Placement
-from slamcli.slam.frame_poses import STEADY_INFORMATION
 from slamcli.slam.localizer import Localizer, Location, nothing_seen
 from slamcli.slam.map_growth import MapGrowth
 from slamcli.slam.place_recognition import PlaceIndex
@@ -36,12 +35,16 @@ class Tracker:
         *,
         frame_points: FramePoints = NO_FRAME_POINTS,
         background: np.ndarray | None = None,
+        stands_still: Rests = rests.NONE,
     ) -> None:
         """Take a recording's features, words and matches; without `frame_points`, texture alone is followed.
 
         background : (F, 4, 4) the camera's motion against what stands still, where it was found beforehand: it predicts, and joins key
             frames
+        stands_still : when the camera does, where that is known: frames in between stay where the first is, and none is a key frame
         """
+        self._is_still = rests.within(stands_still, len(features.stamp), with_last=False)
+        self._stays = rests.within(stands_still, len(features.stamp), with_last=True)
         self._settings, self._background = settings, background
         self._sparse_map = SparseMap(features)
         self._places = PlaceIndex(words, self._sparse_map.kf.frame)
@@ -75,6 +78,10 @@ class Tracker:
         if self._segment < 0:
             self._previous.remember(frame, self._start_segment(i, frame))
             return
+        if self._is_still[i] and self._poses.has_pose(i - 1):
+            self._poses.stay(i)
+            self._previous.remember(frame, nothing_seen(frame))
+            return
         location = self._localizer.locate(i, frame)
         if location is None:
             landmark = self._lose(i, frame)
@@ -98,6 +105,8 @@ class Tracker:
         return self._poses.lost_reason
 
     def _wants_key_frame(self, i: int, frame: FrameFeatures, location: Location) -> bool:
+        if self._stays[i] and self._poses.has_pose(i - 1):
+            return False
         if location.placement is not None:
             return self._leaves_reference_by_depth(i, location.placement)
         return key_frames.wants_key_frame(self._sighting(i, frame, location.landmark), self._settings)
@@ -144,7 +153,7 @@ class Tracker:
         if len(before):
             other = int(before[-1])
             T_ij = product(se3.inverse(T_wb[frame[kf]]), T_wb[frame[other]])
-            self._sparse_map.add_edge(kf, other, T_ij, STEADY_INFORMATION)
+            self._sparse_map.add_edge(kf, other, T_ij, background_prior.BETWEEN_KEY_FRAMES)
 
     def _add_previous_as_key_frame(self, i: int) -> int | None:
         """Make the frame before `i` a key frame that depth can be aligned with; None where its own pose is not fully measured."""

@@ -12,7 +12,7 @@ from slamcli.calibration.self_calibration import Sensing
 from slamcli.config.options import Config
 from slamcli.errors import SlamError
 from slamcli.formats.g2o import write_g2o
-from slamcli.schema import LOST, Closures, Map, Moving, Timing, Tracks, Words, frame_segments
+from slamcli.schema import LOST, Closures, Map, Moving, Rests, Timing, Tracks, Words, frame_segments
 from slamcli.slam import doubt, final_refinement, loop_pose_graph, map_segments, pose_doubt
 from slamcli.slam.depth_tracking import FramePoints
 from slamcli.slam.loop_candidates import Candidate
@@ -52,6 +52,7 @@ def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
             iterations=cfg.loop.iterations,
             progress=tools.progress,
             workers=tools.workers,
+            stands_still=inputs.load(Rests, "track"),
         )
     map_ = map_segments.anchored(main_first(sparse_map.snapshot(), tracks, cfg.loop.main_segment), tracks)
     write_pose_graph(out / "posegraph.g2o", map_.T_wk, loop_pose_graph.build(sparse_map, accepted, cfg.loop))

@@ -10,8 +10,8 @@ from slamcli import artifacts
 from slamcli.calibration import rolling_shutter, self_calibration
 from slamcli.calibration.self_calibration import Sensing
 from slamcli.config.options import Config
-from slamcli.schema import Features, Map, Moving, Timing, Tracks
-from slamcli.slam import calibration_doubt, doubt, final_refinement, map_segments
+from slamcli.schema import Features, Map, Moving, Rests, Timing, Tracks
+from slamcli.slam import calibration_doubt, doubt, final_refinement, map_segments, rests
 from slamcli.slam.depth_tracking import NO_FRAME_POINTS, FramePoints
 from slamcli.sparse_map import map_adjustment
 from slamcli.sparse_map.sparse_map import SparseMap
@@ -32,7 +32,9 @@ def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
     if cfg.optimize.enabled and len(map_.kf_frame) > 1:
         sparse_map = SparseMap.from_map(features, map_)
         frame_points = FramePoints(depth, given, cfg.sensor)
-        tracks, sensing, summary = refine(sparse_map, features, tracks, sensing, cfg, tools, frame_points=frame_points)
+        tracks, sensing, summary = refine(
+            sparse_map, features, tracks, sensing, cfg, tools, frame_points=frame_points, stands_still=inputs.load(Rests, "track")
+        )
         doubts = calibration_doubt.judge(sparse_map, sensing, cfg.sensor)
         for one in doubts:
             tools.warn(one.text)
@@ -53,6 +55,7 @@ def refine(
     tools: Tools,
     *,
     frame_points: FramePoints = NO_FRAME_POINTS,
+    stands_still: Rests = rests.NONE,
 ) -> tuple[Tracks, Sensing, dict]:
     """Adjust the map, find what of the camera suits it, and again; returns tracks, what was found, and the evidence.
 
@@ -82,6 +85,7 @@ def refine(
         iterations=cfg.optimize.iterations,
         progress=tools.progress,
         workers=tools.workers,
+        stands_still=stands_still,
     )
     summary = {} if result is None else {"cost": [*cost, result.cost[-1]], "outliers": int((~result.is_inlier).sum())}
     return tracks, sensing, summary

@@ -14,9 +14,10 @@ from slamcli.schema import (
     Features,
     Matches,
     Moving,
+    Rests,
     Words,
 )
-from slamcli.slam import map_segments, moving_objects
+from slamcli.slam import map_segments, moving_objects, rests
 from slamcli.slam.background_motion import BackgroundMotion
 from slamcli.slam.depth_tracking import FramePoints
 from slamcli.slam.tracker import Tracker
@@ -31,14 +32,15 @@ BACKGROUND_ROUNDS = 2  # the second halves the error of the motion from frame to
 def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
     """Track every frame and build the map of key frames and landmarks; where things move, once more without them."""
     features, moving = inputs.load(Features, "extract"), NOTHING
-    tracker = _track(inputs, moving, None, cfg, tools)
+    tracker, stands_still = _track(inputs, moving, None, cfg, tools)
     if cfg.track.moving_objects and moving_parts.are_any(inputs, tracker.tracks(), tracker.map()):
         moving, background = _find_background(inputs, cfg, tools)
-        tracker = _track(inputs, moving, background, cfg, tools)
+        tracker, stands_still = _track(inputs, moving, background, cfg, tools)
         moving = moving_parts.find(inputs, tracker.tracks(), tracker.map(), tools)
     tracks = tracker.tracks()
     map_ = map_segments.anchored(map_segments.ranked(tracker.map(), tracks), tracks)
     artifacts.save(moving, out)
+    artifacts.save(stands_still, out)
     lost = lost_spans(tracks.state, tracker.lost_reason)
     for first, last, reason in lost:
         tools.warn(f"frames {first} to {last} are lost: {reason}" if last > first else f"frame {first} is lost: {reason}")
@@ -49,6 +51,7 @@ def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
         "lost": int((tracks.state == LOST).sum()),
         "relocalized": int((tracks.state == RELOCALIZED).sum()),
         "on_depth": int((tracks.state == ON_DEPTH).sum()),
+        "at_rest": int(np.diff(stands_still.rest_span).sum()),
         "segments": map_segments.n_segments(map_),
         "key_frames": len(map_.kf_frame),
         "landmarks": len(map_.lm_xyz),
@@ -62,26 +65,29 @@ def _find_background(inputs: Inputs, cfg: Config, tools: Tools) -> tuple[Moving,
 
     Once most of what moves is known, the motion is found again without it.
     """
-    words, depth, camera, moving = inputs.load(Words, "match"), moving_parts.coarse_images(inputs), inputs.camera(), NOTHING
-    for _ in range(BACKGROUND_ROUNDS):
+    words, depth, camera = inputs.load(Words, "match"), moving_parts.coarse_images(inputs), inputs.camera()
+    moving, T_wc = NOTHING, np.tile(np.eye(4), (len(depth), 1, 1))
+    for number in range(BACKGROUND_ROUNDS):
         features, still = moving_parts.still(inputs, moving)
         motion = BackgroundMotion(features, words, still, camera, cfg.sensor, tools.rng())
-        T_wc = motion.poses(lambda anchors: tools.progress(anchors, "background"))
+        T_wc = motion.poses(lambda anchors: tools.progress(anchors, "background"), before=T_wc if number else None)
         views = moving_objects.Views(depth, np.asarray(features.stamp), T_wc, np.zeros(len(T_wc), dtype=np.int64), camera)
         moving = Moving(moving_objects.find(views, lambda frames: tools.progress(frames, "moving objects")))
     return moving, T_wc
 
 
-def _track(inputs: Inputs, moving: Moving, background: np.ndarray | None, cfg: Config, tools: Tools) -> Tracker:
-    """Track every frame on what does not move."""
+def _track(inputs: Inputs, moving: Moving, background: np.ndarray | None, cfg: Config, tools: Tools) -> tuple[Tracker, Rests]:
+    """Track every frame on what does not move; returns also when the camera stood still."""
     features, depth = moving_parts.still(inputs, moving)
+    words, matches, camera = inputs.load(Words, "match"), inputs.load(Matches, "match"), inputs.camera()
+    stands_still = rests.find(features, words, matches, camera) if cfg.track.rests else rests.NONE
     tracker = Tracker(
-        features, inputs.load(Words, "match"), inputs.load(Matches, "match"), inputs.camera(), cfg.track, cfg.sensor, tools.rng(),
-        frame_points=FramePoints(depth, inputs.camera(), cfg.sensor), background=background,
+        features, words, matches, camera, cfg.track, cfg.sensor, tools.rng(),
+        frame_points=FramePoints(depth, camera, cfg.sensor), background=background, stands_still=stands_still,
     )  # fmt: skip
     for i in tools.progress(range(len(features.stamp)), "track"):
         tracker.process(i)
-    return tracker
+    return tracker, stands_still
 
 
 def lost_spans(state: np.ndarray, reason: dict[int, str]) -> list[tuple[int, int, str]]:

@@ -72,3 +72,17 @@ def test_recorded_motion_is_interpolated_at_both_clocks() -> None:
 def test_a_trajectory_of_one_pose_stands_still() -> None:
     trajectory = Trajectory(stamp=np.array([1.0]), T_wc=np.eye(4)[None])
     assert drive.interpolate(trajectory, np.array([1.0])).shape == (1, 4, 4)
+
+
+def test_a_rest_is_one_pose_half_way_on_the_same_drive() -> None:
+    plain, paused = rounds(3).colour_T_lc, rounds(3, frames=300 + 60, rest=4.0).colour_T_lc
+    step = np.linalg.norm(np.diff(paused[:, :3, 3], axis=0), axis=1)
+    still = np.flatnonzero(step == 0.0)
+    assert 58 <= len(still) <= 61 and (np.diff(still) == 1).all() and abs(still.mean() - 179) < 1
+    assert step.max() < 0.08
+    np.testing.assert_allclose(paused[[0, -1]], plain[[0, -1]], atol=1e-9)
+
+
+def test_without_a_number_of_frames_a_rest_adds_its_own() -> None:
+    drive_on = {"frames": None, "speed": 0.4, "turn_rate": 0.6}
+    assert len(rounds(1, rest=2.0, **drive_on).colour_stamp) == len(rounds(1, **drive_on).colour_stamp) + 30

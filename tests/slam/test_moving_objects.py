@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import cache
+from itertools import product
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from slamcli.depth import icp
 from slamcli.geometry import se3
 from slamcli.schema import Features, Words
 from slamcli.slam import background_motion_kernels, moving_object_kernels, moving_objects
-from slamcli.slam.background_motion import BackgroundMotion, anchor_frames
+from slamcli.slam.background_motion import SWERVE_COST, SWERVE_M, SWERVE_MOST, BackgroundMotion, Judgement, _steadiest, anchor_frames
 from slamcli.slam.moving_objects import STEP, Views
 
 FRAMES, RATE, SPEED = 36, 15.0, 0.6
@@ -157,13 +158,14 @@ def test_votes_are_counted_as_by_hand() -> None:
     best, total = background_motion_kernels.vote(
         T, x, np.ascontiguousarray(xy), depth, np.full(60, 1.0), np.full(60, 50.0), weight, pinhole, 9.0, agrees
     )
-    expected = []
+    expected, shares = [], []
     for pose in T:
         y = se3.transform(pose, x)
         e = ((y[:, :2] / y[:, 2:] * pinhole[:2] + pinhole[2:] - xy) ** 2).sum(axis=1)
         e += np.nan_to_num((y[:, 2] - depth) * 50.0) ** 2
         expected.append(e < 9.0)
-    sums = [weight[one].sum() for one in expected]
+        shares.append(np.maximum(0.0, 1.0 - e / 9.0))
+    sums = [(weight * one).sum() for one in shares]
     assert best == np.argmax(sums) == 1 and total == pytest.approx(max(sums))
     np.testing.assert_array_equal(agrees, expected[1])
 
@@ -211,3 +213,35 @@ def test_anchors_are_apart_and_hold_both_ends() -> None:
     assert anchors[0] == 0 and anchors[-1] == 79 and (np.diff(anchors) > 0).all()
     assert (np.diff(stamp[anchors])[:-1] >= 0.35 - 1e-6).all() and np.diff(stamp[anchors]).max() < 0.35 + 0.2
     assert anchor_frames(stamp[:1]) == [0]
+
+
+def judged(scores: list[float], forward: list[float]) -> list[Judgement]:
+    """Candidates of one step, which go so far forward."""
+    pairs = zip(scores, forward, strict=True)
+    return [Judgement(se3.exp(np.array([0.0, 0.0, z, 0.0, 0.0, 0.0])), score, score, 0.0, np.zeros(0, bool)) for score, z in pairs]
+
+
+def test_one_wrong_step_does_not_lead_those_after_it_astray() -> None:
+    """Somebody walks along: at one step the camera's rest is believed a little more, and of every later one the same is expected."""
+    steps = [judged([0.6, 0.5], [0.2, 0.0]), judged([0.48, 0.5], [0.2, 0.0]), *(judged([0.6, 0.58], [0.2, 0.0]) for _ in range(4))]
+    chosen = _steadiest(steps, [1.0] * len(steps))
+    np.testing.assert_allclose([T[2, 3] for T in chosen], 0.2, atol=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_steadiest_motions_are_those_of_all_combinations(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    steps, scale = (
+        [judged(rng.uniform(0.2, 0.7, 3).tolist(), rng.uniform(-0.2, 0.2, 3).tolist()) for _ in range(5)],
+        rng.uniform(0.8, 1.2, 5),
+    )
+
+    def worth(numbers: tuple[int, ...]) -> float:
+        chosen = [one[number] for one, number in zip(steps, numbers, strict=True)]
+        pairs = zip(chosen[:-1], chosen[1:], scale[1:], strict=True)
+        change = [min(((b.T[2, 3] - share * a.T[2, 3]) / SWERVE_M) ** 2, SWERVE_MOST) for a, b, share in pairs]
+        return sum(one.score for one in chosen) - SWERVE_COST * sum(change)
+
+    best = max(product(range(3), repeat=5), key=worth)
+    found = _steadiest(steps, scale.tolist())
+    np.testing.assert_allclose([T[2, 3] for T in found], [one[number].T[2, 3] for one, number in zip(steps, best, strict=True)], atol=1e-12)

@@ -9,6 +9,7 @@ from slamcli.geometry import se3
 from slamcli.schema import Trajectory
 
 DENSE = 4000  # points of a closed path
+BRAKE = 1.0  # [s] to come to a rest from full speed, and to leave it again
 
 
 @dataclass(frozen=True)
@@ -36,12 +37,13 @@ def closed_path(low: np.ndarray, high: np.ndarray, margin: float, rng: np.random
 
 def rounds(
     path: np.ndarray, *, frames: int | None, speed: float, turn_rate: float, rate: float, laps: float, height: float, pitch: float,
-    rng: np.random.Generator,
+    rng: np.random.Generator, rest: float = 0.0,
 ) -> Motion:  # fmt: skip
     """Drive along a closed path.
 
     frames : number of images; None = as many as `speed` [m/s] and `turn_rate` [rad/s], at most, take at `rate` [Hz]
     laps : rounds, any fraction
+    rest : [s] of standing still half-way
     height, pitch : of the camera [m], [rad], positive up; the robot rocks by some millimetres and tenths of a degree
     """
     step = np.roll(path, -1, axis=0) - path
@@ -51,8 +53,8 @@ def rounds(
     seconds = _smooth_closed(np.hypot(length / speed, turn / turn_rate)[:, None], 0.02)[:, 0]
     clock = np.concatenate([[0.0], np.cumsum(seconds)])  # at each point of the path, over one lap
     total = laps * clock[-1]
-    n = frames if frames is not None else max(2, round(total * rate) + 1)
-    when = np.linspace(0.0, total, n)
+    n = frames if frames is not None else max(2, round(total * rate) + 1) + round(rest * rate)
+    when = _clock(total, n, rate, rest)
     share = np.interp(when % clock[-1], clock, np.arange(DENSE + 1) / DENSE) + when // clock[-1]
     xy, psi = _at(path, share), _heading_at(path, share)
     wobble = [_sway(share, rng) for _ in range(5)]
@@ -62,6 +64,16 @@ def rounds(
     T_lc = look_along(position, look + 0.01 * wobble[2], pitch + 0.005 * wobble[3], 0.005 * wobble[4])
     stamp = np.round(np.arange(n) / rate, 6)
     return Motion(stamp, T_lc, stamp, T_lc)
+
+
+def _clock(total: float, n: int, rate: float, rest: float) -> np.ndarray:
+    """Return how much (n,) of a drive of `total` [s] lies behind at each image: evenly more, but for a rest [s] half-way and brakes around it."""
+    if rest == 0.0:
+        return np.linspace(0.0, total, n)
+    between = (np.arange(n - 1) + 0.5 - (n - 1) / 2) / rate  # [s] from the middle of the rest, of each step from image to image
+    step = np.clip((np.abs(between) - rest / 2) / BRAKE, 0.0, 1.0)
+    way = np.concatenate([[0.0], np.cumsum(step)])
+    return total * (way / max(way[-1], 1e-9))
 
 
 def _sway(share: np.ndarray, rng: np.random.Generator) -> np.ndarray:
