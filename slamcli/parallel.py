@@ -45,6 +45,19 @@ def one_thread_in_blas() -> Iterator[None]:
 
 
 @contextmanager
+def least_instructions_in_opencv() -> Iterator[None]:
+    """Keep OpenCV to the instructions that every x86-64 processor has: its blurs of real numbers round otherwise with others."""
+    import cv2
+
+    before = cv2.useOptimized()
+    cv2.setUseOptimized(False)
+    try:
+        yield
+    finally:
+        cv2.setUseOptimized(before)
+
+
+@contextmanager
 def _one_thread_in_opencv() -> Iterator[None]:
     """Keep OpenCV from starting its own threads within each of ours: the two would multiply."""
     import cv2

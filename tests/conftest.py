@@ -11,6 +11,7 @@ from hypothesis import settings
 from slamcli.jit import compilation
 
 ROOM_FRAMES = 40
+ROOM = {"seed": 1, "frames": ROOM_FRAMES, "laps": 0.15, "width": 160, "height": 120}  # settings of the simulated recording `room`
 
 # A kernel's first call compiles it, which takes longer than any deadline; and the same examples every time, as a red run must be repeatable.
 settings.register_profile("slamcli", deadline=None, derandomize=True)
@@ -64,7 +65,7 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from slamcli.datasets.simulate import simulate
 
     folder = tmp_path_factory.mktemp("recordings") / "room"
-    return simulate(folder, progress=silent, seed=1, frames=ROOM_FRAMES, laps=0.15, width=160, height=120)
+    return simulate(folder, progress=silent, **ROOM)
 
 
 @pytest.fixture(scope="session")

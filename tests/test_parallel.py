@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from threadpoolctl import threadpool_info
 
-from slamcli.parallel import one_thread_in_blas, ordered_map
+from slamcli.parallel import least_instructions_in_opencv, one_thread_in_blas, ordered_map
 
 
 @settings(max_examples=30, deadline=None)
@@ -90,3 +90,15 @@ def test_opencv_keeps_to_one_thread_meanwhile_and_gets_its_own_back(ends: str) -
     else:
         assert list(results) == [1, 1, 1]
     assert cv2.getNumThreads() == before
+
+
+def test_opencv_keeps_to_the_least_instructions_meanwhile_and_gets_the_others_back() -> None:
+    def fail() -> None:
+        with least_instructions_in_opencv():
+            assert not cv2.useOptimized()
+            raise KeyError
+
+    before = cv2.useOptimized()
+    with pytest.raises(KeyError):
+        fail()
+    assert cv2.useOptimized() == before

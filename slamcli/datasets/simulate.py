@@ -18,7 +18,7 @@ from slamcli.errors import SlamError
 from slamcli.formats.trajectory import read_tum, write_tum
 from slamcli.geometry.algebra import product
 from slamcli.geometry.camera import Camera
-from slamcli.parallel import ordered_map
+from slamcli.parallel import least_instructions_in_opencv, ordered_map
 from slamcli.schema import Trajectory
 
 FORMAT = 1  # of scene.json
@@ -73,7 +73,7 @@ class Simulation:
 def simulate(out: Path, *, progress: Progress, workers: int = 2, **settings: object) -> Path:
     """Write a simulated recording into the new folder `out`; see Simulation for the settings.
 
-    The same settings give the same bytes on the same machine. The folder appears only when complete.
+    The same settings give the same bytes. The folder appears only when complete.
     """
     what = Simulation(**settings)  # type: ignore[arg-type]
     _check(what)
@@ -84,7 +84,7 @@ def simulate(out: Path, *, progress: Progress, workers: int = 2, **settings: obj
         motion, scene.low, scene.high, people=what.people, activities=what.activities or tuple(people.ACTIVITIES),
         drives=what.trajectory is None, seed=what.seed,
     )  # fmt: skip
-    with staged(out) as staging:
+    with staged(out) as staging, least_instructions_in_opencv():
         (staging / "rgb").mkdir()
         (staging / "depth").mkdir()
         if figures:
