@@ -3,11 +3,13 @@
 import numpy as np
 
 from slamcli.geometry.camera import Camera
+from slamcli.geometry.depth_noise import DepthNoise
 
 ROOM = ((0.0, 0.0, 0.0), (8.0, 5.0, 2.5))  # walls, floor and ceiling, seen from inside
 TABLE, CUPBOARD = ((5.2, 1.6, 0.0), (6.4, 2.4, 0.72)), ((2.0, 4.5, 0.0), (3.2, 5.0, 1.8))
 HANGING, LOW = ((4.0, 1.5, 0.3), (4.5, 1.85, 0.9)), ((1.4, 2.0, 0.0), (1.7, 2.5, 0.12))
 FURNITURE = (TABLE, CUPBOARD, HANGING, LOW)
+READING = DepthNoise(0.0012, 0.0019)  # of a Kinect
 KINECT = Camera(160, 120, 147.3, 152.3, 79.5, 59.5)  # 57 x 43 degrees
 
 

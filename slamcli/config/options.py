@@ -45,8 +45,10 @@ class RecordingConfig:
 
 @dataclass(frozen=True)
 class SensorConfig:
-    """The depth camera's noise and what a measurement is worth; shared by track, optimize, loop."""
+    """The depth camera's noise and reach: what a measurement is worth, to every stage from track on."""
 
+    reading_noise_base: float = option(0.0012, "sigma of one depth reading at 0.4 m, the sensor's alone [m]", gt=0)
+    reading_noise_quadratic: float = option(0.0019, "growth of a reading's sigma with (z - 0.4 m)^2 [1/m]", ge=0)
     depth_noise_base: float = option(0.008, "depth sigma at 0.4 m, with the errors of calibration and poses [m]", gt=0)
     depth_noise_quadratic: float = option(0.008, "growth of the depth sigma with (z - 0.4 m)^2 [1/m]", ge=0)
     pixel_noise: float = option(1.0, "sigma of a key point at octave 0 [px]; grows with the octave's scale", gt=0)
@@ -249,8 +251,6 @@ class LoopConfig:
 class SurfaceConfig:
     """How a depth image is cleaned; densify and octree each have these options."""
 
-    noise_base: float = option(0.0012, "sigma of one reading at 0.4 m, the sensor's alone [m]", gt=0)
-    noise_quadratic: float = option(0.0019, "growth of a reading's sigma with (z - 0.4 m)^2 [1/m]", ge=0)
     edge: int = option(2, "readings at most this far from a depth jump are dropped [px]", ge=1, le=20)
     window: float = option(2.0, "half width of the smoothing window, per metre of distance [px/m]", ge=0, le=20)
     max_angle_deg: float = option(78.0, "surfaces seen at a larger angle to the normal are dropped [degrees]", gt=0, lt=90)

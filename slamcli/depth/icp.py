@@ -18,7 +18,7 @@ import numpy as np
 from slamcli.config.options import SensorConfig, SurfaceConfig
 from slamcli.depth import icp_kernels as kernels
 from slamcli.depth import noise_model, oriented_points
-from slamcli.geometry import se3
+from slamcli.geometry import depth_noise, se3
 from slamcli.geometry.algebra import eigh, product
 from slamcli.geometry.camera import Camera
 
@@ -113,16 +113,16 @@ def surface_points(coarse_depth: np.ndarray, camera: Camera, sensor: SensorConfi
     """
     small, row_at = coarse_camera(camera)
     depth = camera.reread(coarse_depth.astype(np.float32) * np.float32(UNIT), given or camera)
+    noise = noise_model.reading_noise(sensor)
     seen = oriented_points.surface(
-        depth, small, settings=CLEANING, stride=1, spacing=0.0, depth_min=sensor.depth_min, depth_max=sensor.depth_max
+        depth, small, settings=CLEANING, noise=noise, stride=1, spacing=0.0, depth_min=sensor.depth_min, depth_max=sensor.depth_max
     )
     row = np.full(depth.size + 1, -1, dtype=np.int32)
     row[seen.pixel] = np.arange(len(seen.pixel), dtype=np.int32)
-    sigma = noise_model.depth_sigma(seen.xyz_c[:, 2], base=CLEANING.noise_base, quadratic=CLEANING.noise_quadratic)
     return OrientedPoints(
         xyz=seen.xyz_c,
         normal=seen.normal_c,
-        variance=np.square(sigma).astype(np.float32),
+        variance=np.square(depth_noise.sigmas(seen.xyz_c[:, 2], noise)).astype(np.float32),
         row=row[row_at],
         pinhole=np.array([small.fx, small.fy, small.cx, small.cy]),
     )

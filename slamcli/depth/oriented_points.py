@@ -7,8 +7,9 @@ import numpy as np
 from numba import f4, f8, i4, i8
 
 from slamcli.config.options import SurfaceConfig
-from slamcli.geometry import elementary
+from slamcli.geometry import depth_noise, elementary
 from slamcli.geometry.camera import Camera
+from slamcli.geometry.depth_noise import DepthNoise
 from slamcli.jit.kernel import kernel
 
 JUMP_SIGMA = 4.0  # a depth step is a jump from this many sigma on, beyond what the steepest slope allowed would give
@@ -28,7 +29,15 @@ class Surface:
 
 
 def surface(
-    depth: np.ndarray, camera: Camera, *, settings: SurfaceConfig, stride: int, spacing: float, depth_min: float, depth_max: float
+    depth: np.ndarray,
+    camera: Camera,
+    *,
+    settings: SurfaceConfig,
+    noise: DepthNoise,
+    stride: int,
+    spacing: float,
+    depth_min: float,
+    depth_max: float,
 ) -> Surface:
     """Find the pixels of a depth image (H, W) [m] that lie on a surface; smooth their depth and give the normals.
 
@@ -38,6 +47,7 @@ def surface(
     A plane's inverse depth is linear in the pixel. So two pixels opposite each other, as seen from a third, have its inverse depth on
     average, however slanted the plane: such pairs are averaged where they agree within the noise, and their differences give the normal.
 
+    noise : of a single reading
     stride : every stride-th row and column is looked at, and where that is so near that the points lie closer together than `spacing`
         [m], every second or fourth of these
     """
@@ -54,8 +64,7 @@ def surface(
         settings.window,
         1.0 / depth_max,
         1.0 / max(depth_min, 1e-3),
-        settings.noise_base,
-        settings.noise_quadratic,
+        noise,
         elementary.cos(np.radians(settings.max_angle_deg)),
         elementary.tan(np.radians(settings.max_angle_deg)) / camera.fx,
         out.pixel,
@@ -82,8 +91,7 @@ def _find_surface(
     window: f8,
     low: f8,
     high: f8,
-    noise_base: f8,
-    noise_quadratic: f8,
+    noise: DepthNoise,
     min_cosine: f8,
     steepest: f8,
     pixel: i4[::1],
@@ -103,7 +111,7 @@ def _find_surface(
             if (u // stride | v // stride) & (thinning - 1) != 0:
                 continue
             z = 1.0 / q
-            sigma = (noise_base + noise_quadratic * (z - 0.4) ** 2) * q * q  # of inverse depth
+            sigma = depth_noise.sigma(z, noise) * q * q  # of inverse depth
             if _is_at_jump(inverse, v, u, edge, JUMP_SIGMA * sigma + edge * steepest * q):
                 continue
             half = min(MAX_WINDOW, max(1, int(window * z + 0.5)), v, u, height - 1 - v, width - 1 - u)

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slamcli.depth import noise_model
-from slamcli.depth.icp import CLEANING, OrientedPoints
+from slamcli.depth.icp import OrientedPoints
 from slamcli.geometry import se3
 from slamcli.schema import Grid
 
@@ -100,7 +99,7 @@ def known_share(grid: Grid, xyz_l: np.ndarray) -> float:
 
 def sees_floor(view: View, *, max_range: float) -> bool:
     """Tell whether a view shows enough of the floor, within `max_range` [m] of the camera, for the grid to learn from it."""
-    sigma = noise_model.depth_sigma(view.surface.xyz[:, 2], base=CLEANING.noise_base, quadratic=CLEANING.noise_quadratic)
+    sigma = np.sqrt(view.surface.variance)
     is_floor = (np.abs(view.xyz_l[:, 2]) < FLOOR_BAND + 2.0 * sigma) & (view.normal_l[:, 2] > UPWARD) & (view.surface.xyz[:, 2] < max_range)
     return bool(is_floor.sum() >= LEAST_FLOOR * view.surface.row.size)
 
@@ -108,7 +107,7 @@ def sees_floor(view: View, *, max_range: float) -> bool:
 def is_flat_wall(view: View, *, least: float = 0.9) -> bool:
     """Tell whether one upright plane holds at least the share `least` of what a view shows."""
     xyz, normal = view.xyz_l[::SAMPLED], view.normal_l[::SAMPLED]
-    sigma = 2.0 * noise_model.depth_sigma(view.surface.xyz[::SAMPLED, 2], base=CLEANING.noise_base, quadratic=CLEANING.noise_quadratic)
+    sigma = 2.0 * np.sqrt(view.surface.variance[::SAMPLED])
     if len(xyz) < 10:
         return False
     on_plane = np.ones(len(xyz), dtype=bool)
@@ -146,6 +145,7 @@ def compare(source: View, target: View) -> tuple[int, np.ndarray]:
         return nothing
     xyz = se3.transform(T_ts, source.surface.xyz[::SAMPLED].astype(np.float64))
     normal, z = source.surface.normal[::SAMPLED] @ T_ts[:3, :3].T, xyz[:, 2]
+    sigma = np.sqrt(source.surface.variance[::SAMPLED])
     fx, fy, cx, cy = target.surface.pinhole
     with np.errstate(divide="ignore", invalid="ignore"):
         column, row = np.rint(xyz[:, 0] / z * fx + cx), np.rint(xyz[:, 1] / z * fy + cy)
@@ -155,10 +155,9 @@ def compare(source: View, target: View) -> tuple[int, np.ndarray]:
         return nothing
     met = target.surface.row[row[is_in].astype(np.int64), column[is_in].astype(np.int64)]
     is_met = met >= 0
-    xyz, normal, met = xyz[is_in][is_met], normal[is_in][is_met], met[is_met]
+    xyz, normal, sigma, met = xyz[is_in][is_met], normal[is_in][is_met], sigma[is_in][is_met], met[is_met]
     n = target.surface.normal[met]
     in_front = ((xyz - target.surface.xyz[met]) * n).sum(axis=1)
-    sigma = sum(noise_model.depth_sigma(d, base=CLEANING.noise_base, quadratic=CLEANING.noise_quadratic) for d in (xyz[:, 2], target.surface.xyz[met, 2]))  # fmt: skip
     is_same = (normal * n).sum(axis=1) > SAME_SURFACE
-    limit = THICKNESS + 3.0 * sigma
+    limit = THICKNESS + 3.0 * (sigma + np.sqrt(target.surface.variance[met]))
     return int((is_same & (np.abs(in_front) < limit)).sum()), in_front[is_same & (in_front >= limit) & (in_front < FARTHEST_TWIN)]

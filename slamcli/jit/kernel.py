@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
-from numba import njit
+from numba import f8, njit, types
 
 from slamcli.jit.cache import KernelCache
 
@@ -15,6 +15,7 @@ def kernel(function: Callable | None = None, **options: Any) -> Any:
 
     Annotate the arguments of what Python calls with numba's types, `def add(total: f8[::1], step: f8)`: such a kernel can be compiled
     before its first call, while numba alone would let the user wait for one after another. Helpers that only kernels call need none.
+    Arguments that travel together are a NamedTuple, whose fields are annotated in the same way.
     """
     if function is None:
         return lambda function: kernel(function, **options)
@@ -30,4 +31,12 @@ def argument_types(compiled: Any) -> tuple:
     code = compiled.py_func.__code__
     annotations = compiled.py_func.__annotations__
     names = code.co_varnames[: code.co_argcount]
-    return tuple(annotations[name] for name in names) if any(name in annotations for name in names) else ()
+    return tuple(_compiler_type(annotations[name]) for name in names) if any(name in annotations for name in names) else ()
+
+
+def _compiler_type(annotation: Any) -> Any:
+    """Return numba's type of an argument: of a NamedTuple, the type that numba finds for its values."""
+    if isinstance(annotation, type) and issubclass(annotation, tuple):
+        fields = [f8 if of is float else of for of in annotation.__annotations__.values()]
+        return types.BaseTuple.from_types(fields, annotation)
+    return annotation

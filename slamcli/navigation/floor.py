@@ -13,6 +13,7 @@ from slamcli.config.options import GroundConfig
 from slamcli.geometry import elementary
 from slamcli.geometry.algebra import eigh, product
 from slamcli.geometry.camera import Camera
+from slamcli.geometry.depth_noise import DepthNoise
 from slamcli.navigation.floor_paper import paper_plane
 from slamcli.navigation.surface_patches import Patches, Support, collect, fit_plane
 from slamcli.schema import Ground
@@ -33,16 +34,18 @@ def find_ground(
     *,
     T_wc: np.ndarray,
     settings: GroundConfig,
+    noise: DepthNoise,
     rng: np.random.Generator,
 ) -> Ground:
     """Find the floor and the frame in which it is level.
 
     frames : (depth (H, W) float32 [m], NaN = none; T_wk (4, 4) camera to world) per key frame, any choice of them
+    noise : of a single depth reading
     T_wc : (4, 4) camera to world, of the camera below which the level frame has its origin and whose heading is the x axis
     Returns Ground; `is_found` is False where no floor is in view, and `T_lw` then only turns the world so that z is up at best guess,
     with that camera at z = 0.
     """
-    patches, T_wk = collect(frames, camera, side=settings.stride, max_range=settings.max_range)
+    patches, T_wk = collect(frames, camera, side=settings.stride, max_range=settings.max_range, noise=noise)
     if len(T_wk) == 0:
         return _not_found(T_wc, up=-T_wc[:3, 1])
     up = vertical(patches, T_wk)

@@ -2,13 +2,16 @@
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import f4, f8, i4, i8, u1, u2
 
 from slamcli.config.options import GridConfig, SensorConfig
+from slamcli.depth import noise_model
 from slamcli.errors import SlamError
-from slamcli.geometry import se3
+from slamcli.geometry import depth_noise, se3
+from slamcli.geometry.depth_noise import DepthNoise
 from slamcli.jit.kernel import kernel
 
 SLICES = 16  # of the band's height, one bit each
@@ -17,6 +20,7 @@ NOT_SEEN, PASSED, SEEN = 0, 1, 2  # of a cell's floor: PASSED is a line of sight
 HOLE_POINTS = 2  # readings through the floor's plane that make a cell a hole: one may be a slip
 ROWS = 120  # of an image: a surface is level by a pixel this share above; a nearer one would show the noise instead of the slope
 OPEN_STRIDE = 3  # open lines of sight are followed at every so many of the pixels whose points are sorted
+NOISE_SIGMAS = 2.0  # that a reading may be off: a point's height, and the end of a line of sight
 TOP_REACH = 0.3  # [m] above the band: what is seen there from above may be the top of something that reaches into the band
 
 
@@ -35,6 +39,33 @@ class View:
     open_slices: np.ndarray  # (O,) uint16, bits: the slices they crossed
 
 
+class Sight(NamedTuple):
+    """Where depth is sorted into cells, and what counts."""
+
+    corner: f8[::1]  # (2,) column and row of the window's first cell, whole numbers
+    cell: float  # [m] side
+    near: float  # [m] nearer readings are ignored
+    far: float  # [m] farther readings are no points
+    low: float  # [m] of the robot's height band
+    high: float  # [m]
+    drop: float  # [m] below the floor, from which on a point shows a hole
+
+
+class Cells(NamedTuple):
+    """What the points of one view tell of the cells (S, S) of a window."""
+
+    n_band: i4[:, ::1]  # points in the band
+    slices: u2[:, ::1]  # bits: slices of the band with points
+    floor: u1[:, ::1]  # NOT_SEEN, PASSED or SEEN
+    hole: u1[:, ::1]  # lines of sight through the floor's plane
+    top: u1[:, ::1]  # 1 where a level surface just above the band was seen from above
+
+
+def blank_cells(side: int) -> Cells:
+    """Return the cells of a window of `side` cells of which nothing was seen."""
+    return Cells(*(np.zeros((side, side), dtype=of) for of in (np.int32, np.uint16, np.uint8, np.uint8, np.uint8)))
+
+
 def look(depth: np.ndarray, rays: np.ndarray, T_lk: np.ndarray, *, settings: GridConfig, sensor: SensorConfig) -> View:
     """Sort one frame's depth into the cells of a window around the camera.
 
@@ -46,40 +77,24 @@ def look(depth: np.ndarray, rays: np.ndarray, T_lk: np.ndarray, *, settings: Gri
     if not (np.abs(centre) < 1e8).all():
         raise SlamError("grid2d: a key frame lies absurdly far away; check the trajectory")
     side = 2 * half + 1
-    n_band = np.zeros((side, side), dtype=np.int32)
-    slices = np.zeros((side, side), dtype=np.uint16)
-    floor, hole, top = (np.zeros((side, side), dtype=np.uint8) for _ in range(3))
-    crossed = np.zeros((side, side), dtype=np.uint16)
+    seen, crossed = blank_cells(side), np.zeros((side, side), dtype=np.uint16)
     depth, T_lk = np.ascontiguousarray(depth, dtype=np.float32), np.ascontiguousarray(T_lk, dtype=np.float64)
-    of_view = (depth, rays, T_lk, centre - half)
-    of_settings = (cell, settings.min_range, settings.max_range, settings.band_low, settings.band_high)
-    of_sensor = (sensor.depth_noise_base, sensor.depth_noise_quadratic)
-    _sort_points(
-        *of_view,
-        settings.stride,
-        max(settings.stride, depth.shape[0] // ROWS),
-        *of_settings,
-        settings.drop,
-        *of_sensor,
-        n_band,
-        slices,
-        floor,
-        hole,
-        top,
-    )
-    _cross(*of_view, OPEN_STRIDE * settings.stride, *of_settings, *of_sensor, crossed)
+    sight = Sight(centre - half, cell, settings.min_range, settings.max_range, settings.band_low, settings.band_high, settings.drop)
+    noise = noise_model.depth_noise(sensor)
+    _sort_points(depth, rays, T_lk, sight, noise, settings.stride, max(settings.stride, depth.shape[0] // ROWS), seen)
+    _cross(depth, rays, T_lk, sight, noise, OPEN_STRIDE * settings.stride, crossed)
     if settings.extend_down:
-        _extend_down(depth, rays, T_lk, centre - half, settings, n_band, slices)
+        _extend_down(depth, rays, T_lk, centre - half, settings, seen.n_band, seen.slices)
     first = centre.astype(np.int64) - half
-    rows, columns = np.nonzero((n_band > 0) | (floor > 0) | (hole >= HOLE_POINTS) | (top > 0))
+    rows, columns = np.nonzero((seen.n_band > 0) | (seen.floor > 0) | (seen.hole >= HOLE_POINTS) | (seen.top > 0))
     open_rows, open_columns = np.nonzero(crossed)
     return View(
         cell=np.stack([columns + first[0], rows + first[1]], axis=1).astype(np.int32),
-        n_band=n_band[rows, columns],
-        slices=slices[rows, columns],
-        floor=floor[rows, columns],
-        is_hole=hole[rows, columns] >= HOLE_POINTS,
-        is_top=top[rows, columns] > 0,
+        n_band=seen.n_band[rows, columns],
+        slices=seen.slices[rows, columns],
+        floor=seen.floor[rows, columns],
+        is_hole=seen.hole[rows, columns] >= HOLE_POINTS,
+        is_top=seen.top[rows, columns] > 0,
         camera=T_lk[:3, 3].copy(),
         open_cell=np.stack([open_columns + first[0], open_rows + first[1]], axis=1).astype(np.int32),
         open_slices=crossed[open_rows, open_columns],
@@ -88,32 +103,19 @@ def look(depth: np.ndarray, rays: np.ndarray, T_lk: np.ndarray, *, settings: Gri
 
 @kernel
 def _sort_points(
-    depth: f4[:, ::1],
-    rays: f4[:, :, ::1],
-    T: f8[:, ::1],
-    corner: f8[::1],
-    stride: i8,
-    above: i8,
-    cell: f8,
-    near: f8,
-    far: f8,
-    low: f8,
-    high: f8,
-    drop: f8,
-    noise_base: f8,
-    noise_quadratic: f8,
-    n_band: i4[:, ::1],
-    slices: u2[:, ::1],
-    floor: u1[:, ::1],
-    hole: u1[:, ::1],
-    top: u1[:, ::1],
+    depth: f4[:, ::1], rays: f4[:, :, ::1], T: f8[:, ::1], sight: Sight, noise: DepthNoise, stride: i8, above: i8, seen: Cells
 ):
     """Count band points per cell; mark cells whose floor is seen or over which a line of sight passes below the band, holes, and tops.
 
     A line of sight that ends deeper than `drop` below the floor makes the cell in which it crosses the floor's plane a hole; the cells
-    beyond, over which it runs below that plane, may have a floor if it was a reflection. Points closer to the floor than `low` plus twice their height's noise are the floor's; the noise of a height is the depth's noise
-    times the slope of the ray, small at the flat angles under which a robot sees the far floor.
+    beyond, over which it runs below that plane, may have a floor if it was a reflection. Points closer to the floor than `low` plus twice
+    their height's noise are the floor's; the noise of a height is the depth's noise times the slope of the ray, small at the flat angles
+    under which a robot sees the far floor.
+
+    above : rows up to the pixel that tells whether a surface is level
     """
+    corner, cell, near, far, low, high, drop = sight
+    n_band, slices, floor, hole, top = seen
     side = n_band.shape[0]
     for v in range(stride // 2, depth.shape[0], stride):
         for u in range(stride // 2, depth.shape[1], stride):
@@ -125,8 +127,8 @@ def _sort_points(
             dy = T[1, 0] * rx + T[1, 1] * ry + T[1, 2]
             dz = T[2, 0] * rx + T[2, 1] * ry + T[2, 2]
             height = T[2, 3] + z * dz
-            noise = abs(dz) * (noise_base + noise_quadratic * (z - 0.4) * (z - 0.4))
-            if height < -drop - 2.0 * noise and T[2, 3] > 0.0:
+            slack = NOISE_SIGMAS * abs(dz) * depth_noise.sigma(z, noise)
+            if height < -drop - slack and T[2, 3] > 0.0:
                 at = T[2, 3] / -dz
                 j, i = math.floor((T[0, 3] + at * dx) / cell - corner[0]), math.floor((T[1, 3] + at * dy) / cell - corner[1])
                 if at <= far and 0 <= i < side and 0 <= j < side and hole[i, j] < 255:
@@ -143,10 +145,10 @@ def _sort_points(
                     dz2 = T[2, 0] * rays[v - above, u, 0] + T[2, 1] * rays[v - above, u, 1] + T[2, 2]
                     if abs(T[2, 3] + depth[v - above, u] * dz2 - height) < 0.5 * z * (dz2 - dz):
                         top[i, j] = 1
-            elif height >= low + 2.0 * noise:
+            elif height >= low + slack:
                 n_band[i, j] += 1
                 slices[i, j] |= np.uint16(1 << int(SLICES * (height - low) / (high - low)))
-            elif height > -low - 2.0 * noise and dz < 0.0 and v >= above:
+            elif height > -low - slack and dz < 0.0 and v >= above:
                 # The pixel `above` must be as low, or this is the foot of something upright, which noise may have put behind it.
                 z2 = depth[v - above, u]
                 dz2 = T[2, 0] * rays[v - above, u, 0] + T[2, 1] * rays[v - above, u, 1] + T[2, 2]
@@ -167,25 +169,12 @@ def _sort_points(
 
 
 @kernel
-def _cross(
-    depth: f4[:, ::1],
-    rays: f4[:, :, ::1],
-    T: f8[:, ::1],
-    corner: f8[::1],
-    stride: i8,
-    cell: f8,
-    near: f8,
-    far: f8,
-    low: f8,
-    high: f8,
-    noise_base: f8,
-    noise_quadratic: f8,
-    crossed: u2[:, ::1],
-):
+def _cross(depth: f4[:, ::1], rays: f4[:, :, ::1], T: f8[:, ::1], sight: Sight, noise: DepthNoise, stride: i8, crossed: u2[:, ::1]):
     """Mark, as bits per cell, the slices of the band that lines of sight cross: up to a cell and the noise before their end, or to `far`.
 
     A reading beyond `far` is too inexact to be a point, but tells that nothing is nearer.
     """
+    corner, cell, near, far, low, high, _ = sight
     side = crossed.shape[0]
     for v in range(stride // 2, depth.shape[0], stride):
         for u in range(stride // 2, depth.shape[1], stride):
@@ -196,7 +185,7 @@ def _cross(
             dx = T[0, 0] * rx + T[0, 1] * ry + T[0, 2]
             dy = T[1, 0] * rx + T[1, 1] * ry + T[1, 2]
             dz = T[2, 0] * rx + T[2, 1] * ry + T[2, 2]
-            first, last = near, z - 2.0 * (noise_base + noise_quadratic * (z - 0.4) * (z - 0.4)) - cell
+            first, last = near, z - NOISE_SIGMAS * depth_noise.sigma(z, noise) - cell
             if last > far:
                 last = far
             if abs(dz) > 1e-9:

@@ -5,9 +5,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slamcli.geometry import se3
+from slamcli.geometry import depth_noise, se3
 from slamcli.geometry.algebra import eigh, product
 from slamcli.geometry.camera import Camera
+from slamcli.geometry.depth_noise import DepthNoise
 
 MAX_FRAMES = 256  # key frames kept; of more, every second one goes: bounds memory, and a floor needs no more
 
@@ -33,8 +34,13 @@ class Support:
     n_candidates: int  # patches the inliers were chosen from
 
 
-def collect(frames: Iterable[tuple[np.ndarray, np.ndarray]], camera: Camera, *, side: int, max_range: float) -> tuple[Patches, np.ndarray]:
-    """Reduce each key frame to surface patches in the world frame; returns Patches and the T_wk (F, 4, 4) kept."""
+def collect(
+    frames: Iterable[tuple[np.ndarray, np.ndarray]], camera: Camera, *, side: int, max_range: float, noise: DepthNoise
+) -> tuple[Patches, np.ndarray]:
+    """Reduce each key frame to surface patches in the world frame; returns Patches and the T_wk (F, 4, 4) kept.
+
+    noise : of a single reading, which a patch is believed to have: readings side by side err together
+    """
     rays = camera.rays
     shape = (camera.height // side, camera.width // side)
     kept: list[tuple] = []
@@ -42,7 +48,7 @@ def collect(frames: Iterable[tuple[np.ndarray, np.ndarray]], camera: Camera, *, 
     for i, (depth, T_wk) in enumerate(frames):
         if i % step or not np.isfinite(T_wk).all():
             continue
-        kept.append((_patches(depth, rays, T_wk, side, max_range), T_wk))
+        kept.append((_patches(depth, rays, T_wk, side, max_range, noise), T_wk))
         if len(kept) >= MAX_FRAMES:
             kept, step = kept[::2], 2 * step
     if not kept:
@@ -53,8 +59,8 @@ def collect(frames: Iterable[tuple[np.ndarray, np.ndarray]], camera: Camera, *, 
     return Patches(columns[0], columns[1], columns[2], frame, columns[3], shape), np.stack([row[1] for row in kept])
 
 
-def _patches(depth: np.ndarray, rays: np.ndarray, T_wk: np.ndarray, side: int, max_range: float) -> tuple:
-    blocks = _block_points(depth, rays, side, max_range)
+def _patches(depth: np.ndarray, rays: np.ndarray, T_wk: np.ndarray, side: int, max_range: float, noise: DepthNoise) -> tuple:
+    blocks = _block_points(depth, rays, side, max_range, noise)
     normal_k = _normals(blocks)
     rows, columns = np.nonzero(np.isfinite(blocks[..., 2]))
     at = blocks[rows, columns].astype(np.float64)
@@ -62,8 +68,10 @@ def _patches(depth: np.ndarray, rays: np.ndarray, T_wk: np.ndarray, side: int, m
     return se3.transform(T_wk, at[:, :3]), normal_w, at[:, 3], np.stack([rows, columns], axis=1).astype(np.int32)
 
 
-def _block_points(depth: np.ndarray, rays: np.ndarray, side: int, max_range: float) -> np.ndarray:
-    """Average up to 4 x 4 pixels of each `side` x `side` block to a point x y z and its depth's noise (R, C, 4), NaN where the patch spans a depth discontinuity.
+def _block_points(depth: np.ndarray, rays: np.ndarray, side: int, max_range: float, noise: DepthNoise) -> np.ndarray:
+    """Average up to 4 x 4 pixels of each `side` x `side` block to a point x y z and its depth's sigma (R, C, 4).
+
+    NaN where the patch spans a depth discontinuity.
 
     Inverse depth is averaged: on a plane it is linear in the pixel, so that the mean lies on the plane at the pixels' mean ray.
     """
@@ -78,7 +86,7 @@ def _block_points(depth: np.ndarray, rays: np.ndarray, side: int, max_range: flo
     z = n / np.where(has, 1.0 / z[:, is_one], 0.0).sum(axis=0)
     x, y = (z * np.where(has, _samples(rays[..., k], side)[:, is_one], 0.0).sum(axis=0, dtype=np.float64) / n for k in range(2))
     out = np.full((*is_one.shape, 4), np.nan, dtype=np.float32)
-    out[is_one] = np.column_stack([x, y, z, 0.0012 + 0.0019 * (z - 0.4) * (z - 0.4)])
+    out[is_one] = np.column_stack([x, y, z, depth_noise.sigmas(z, noise)])
     return out
 
 

@@ -25,6 +25,7 @@ from slamcli.estimation.camera_pose import PoseEstimate
 from slamcli.geometry import se3
 from slamcli.geometry.algebra import product
 from slamcli.geometry.camera import Camera
+from slamcli.geometry.depth_noise import DepthNoise
 from slamcli.schema import Features, Words
 from slamcli.slam import background_motion_kernels as kernels
 from slamcli.sparse_map import map_adjustment
@@ -37,7 +38,7 @@ SAMPLES, HYPOTHESES = 256, 3  # of three matches; best motions taken in turn, ea
 REFINED = 3  # best motions that are refined
 LEAST = 10  # matches that a refinement needs
 MAX_DISTANCE, RATIO = 64, 0.85  # of descriptors, as in the match stage, a little looser: frames lie farther apart
-FLATNESS = np.array([0.015, 0.006])  # [m, 1/m] distance between surfaces that are the same, and its growth with (z - 0.4)^2
+FLATNESS = DepthNoise(base=0.015, quadratic=0.006)  # distance between surfaces that are the same: several sigma of a reading, and the pose
 SWERVE_M, SWERVE_RAD = 0.08, 0.08  # [m, rad] by which the motion from anchor to anchor changes now and then
 SWERVE_COST, SWERVE_MOST = 0.1, 3.0  # share of the surface that such a change is worth, and how many of them at most
 CANDIDATES, ALIKE = 6, 0.01  # motions kept of each step, and the swerve up to which two are one
@@ -290,7 +291,7 @@ def anchor_frames(stamp: np.ndarray) -> list[int]:
 
 
 def _explain(T: np.ndarray, source: OrientedPoints, target: OrientedPoints) -> tuple[float, float]:
-    return kernels.explain(T, source.xyz, source.normal, target.row, target.xyz, target.normal, target.pinhole, FLATNESS[0], FLATNESS[1])
+    return kernels.explain(T, source.xyz, source.normal, target.row, target.xyz, target.normal, target.pinhole, FLATNESS)
 
 
 def _align(T: np.ndarray, source: OrientedPoints, target: OrientedPoints, prior: PosePrior) -> np.ndarray:

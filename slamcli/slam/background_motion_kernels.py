@@ -3,6 +3,8 @@
 import numpy as np
 from numba import b1, f4, f8, i4
 
+from slamcli.geometry import depth_noise
+from slamcli.geometry.depth_noise import DepthNoise
 from slamcli.jit.kernel import kernel
 
 Z_MIN = 0.05  # [m] nearer to the image plane than this a point falls on nothing
@@ -74,11 +76,11 @@ def _area(xyz, normal, pinhole, j):
 @kernel
 def explain(
     T: f8[:, ::1], xyz_r: f4[:, ::1], normal_r: f4[:, ::1], row: i4[:, ::1], xyz_i: f4[:, ::1], normal_i: f4[:, ::1],
-    pinhole: f8[::1], base: f8, quadratic: f8,
+    pinhole: f8[::1], flatness: DepthNoise,
 ):  # fmt: skip
     """Sum the surface [m^2] of the reference that the frame shows in the same place under T (4, 4), and what it looks through.
 
-    row (h, w) : the frame's point at each pixel of the pinhole camera, -1 = none; surfaces are the same up to base + quadratic (z - 0.4)^2
+    row (h, w) : the frame's point at each pixel of the pinhole camera, -1 = none; surfaces are the same up to `flatness`
     What agrees counts less the farther apart the two are. What is hidden from the frame counts for neither.
     """
     height, width = row.shape
@@ -102,7 +104,7 @@ def explain(
         cosine = n0 * (T[0, 0] * x + T[0, 1] * y + T[0, 2] * z)
         cosine += n1 * (T[1, 0] * x + T[1, 1] * y + T[1, 2] * z) + n2 * (T[2, 0] * x + T[2, 1] * y + T[2, 2] * z)
         distance = abs(n0 * dx + n1 * dy + n2 * dz)
-        allowed = base + quadratic * (xyz_r[j, 2] - 0.4) ** 2
+        allowed = depth_noise.sigma(xyz_r[j, 2], flatness)
         if distance < allowed and cosine > SAME_NORMAL:
             explained += _area(xyz_r, normal_r, pinhole, j) * (1.0 - (distance / allowed) ** 2)
         elif dz < -allowed:

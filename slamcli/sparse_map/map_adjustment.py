@@ -10,7 +10,7 @@ from slamcli.depth import noise_model
 from slamcli.estimation import bundle_adjustment
 from slamcli.estimation.bundle_adjustment import Observations
 from slamcli.estimation.relative_pose_factors import NO_EDGES, Edges
-from slamcli.geometry import se3
+from slamcli.geometry import depth_noise, se3
 from slamcli.geometry.algebra import product
 from slamcli.geometry.camera import Camera
 from slamcli.schema import Features
@@ -36,7 +36,7 @@ def measure(features: Features, rows: np.ndarray | slice, sensor: SensorConfig) 
         xy=np.array(features.xy[rows], dtype=np.float64),
         depth=depth,
         sigma_px=_sigma_of_octave(sensor.pixel_noise, float(features.octave_scale)).take(features.octave[rows]),
-        sigma_z=noise_model.depth_sigma(depth, base=sensor.depth_noise_base, quadratic=sensor.depth_noise_quadratic),
+        sigma_z=depth_noise.sigmas(depth, noise_model.depth_noise(sensor)),
     )
 
 

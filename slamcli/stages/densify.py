@@ -11,7 +11,7 @@ from slamcli.artifacts import save
 from slamcli.config.options import Config, DensifyConfig, SensorConfig
 from slamcli.datasets import Dataset
 from slamcli.dense import exposure, voxel_cloud
-from slamcli.depth import oriented_points
+from slamcli.depth import noise_model, oriented_points
 from slamcli.formats.cloud import write_ply, write_ply_mesh
 from slamcli.geometry.camera import Camera
 from slamcli.navigation import floor
@@ -49,7 +49,9 @@ def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
             if n_used % every == 0:
                 yield view.depth, view.T_wk
 
-    ground = floor.find_ground(frames(), camera, T_wc=FIRST_CAMERA, settings=cfg.ground, rng=tools.rng())
+    ground = floor.find_ground(
+        frames(), camera, T_wc=FIRST_CAMERA, settings=cfg.ground, noise=noise_model.reading_noise(cfg.sensor), rng=tools.rng()
+    )
     if not ground.is_found:
         tools.warn("no floor was found: the level frame is the first camera's, turned to z up")
     if option.method == "tsdf":
@@ -136,6 +138,7 @@ def views(
             depth,
             camera,
             settings=option,
+            noise=noise_model.reading_noise(sensor),
             stride=1 if is_volume else option.stride,
             spacing=0.0 if is_volume else SAMPLES_APART * option.voxel,
             depth_min=sensor.depth_min,

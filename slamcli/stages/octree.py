@@ -9,7 +9,7 @@ from slamcli.config.options import Config, OctreeConfig, SensorConfig
 from slamcli.datasets import Dataset
 from slamcli.dense import change_detection
 from slamcli.dense.occupancy import OccupancyMap, Scan
-from slamcli.depth import oriented_points
+from slamcli.depth import noise_model, oriented_points
 from slamcli.formats import octomap
 from slamcli.geometry import octree, se3
 from slamcli.geometry.algebra import product
@@ -88,6 +88,7 @@ def scans(
             depth,
             camera,
             settings=option,
+            noise=noise_model.reading_noise(sensor),
             stride=option.stride,
             spacing=RAYS_APART * option.resolution,
             depth_min=sensor.depth_min,

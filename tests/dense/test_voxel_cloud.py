@@ -11,7 +11,9 @@ from slamcli.depth import oriented_points
 from slamcli.depth.oriented_points import Surface
 from slamcli.geometry import se3
 from slamcli.geometry.camera import Camera
+from slamcli.geometry.depth_noise import DepthNoise
 
+NOISE = DepthNoise(0.0012, 0.0019)
 CAMERA = Camera(160, 120, 130.0, 131.0, 79.2, 60.3)
 LENS = Camera(160, 120, 130.0, 131.0, 79.2, 60.3, 0.26, -0.95, -0.005, 0.003, 1.16)
 
@@ -29,7 +31,7 @@ def noisy(depth: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 def see(depth: np.ndarray, camera: Camera = CAMERA, *, stride: int = 1, spacing: float = 0.0, depth_max: float = 6.0, **more) -> Surface:
     return oriented_points.surface(
-        depth, camera, settings=DensifyConfig(**more), stride=stride, spacing=spacing, depth_min=0.3, depth_max=depth_max
+        depth, camera, settings=DensifyConfig(**more), noise=NOISE, stride=stride, spacing=spacing, depth_min=0.3, depth_max=depth_max
     )
 
 

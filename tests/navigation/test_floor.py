@@ -3,7 +3,7 @@
 import naive
 import numpy as np
 import pytest
-from boxroom import KINECT, kinect_noise, look_along, render, round_trip
+from boxroom import KINECT, READING, kinect_noise, look_along, render, round_trip
 
 from slamcli.config.options import GroundConfig
 from slamcli.geometry import se3
@@ -24,7 +24,7 @@ def seen(T_lc, *, seed=0, clean=False):
 def find(frames, settings=SETTINGS, camera=KINECT, T_wc=None):
     if T_wc is None:
         T_wc = frames[0][1] if isinstance(frames, list) and frames and np.isfinite(frames[0][1]).all() else np.eye(4)
-    return find_ground(frames, camera, T_wc=T_wc, settings=settings, rng=np.random.default_rng(0))
+    return find_ground(frames, camera, T_wc=T_wc, settings=settings, noise=READING, rng=np.random.default_rng(0))
 
 
 def error_of(found, T_wl):
@@ -167,11 +167,11 @@ def test_block_points_lie_on_the_surface_and_match_their_slow_twin():
     T = look_along([2.0, 2.0, 0.7], 0.4, 0.3)
     depth = kinect_noise(render(T), rng)
     for side in (4, 6):
-        got = surface_patches._block_points(depth, KINECT.rays, side, 5.0)
+        got = surface_patches._block_points(depth, KINECT.rays, side, 5.0, READING)
         np.testing.assert_allclose(got, naive.block_points(depth, KINECT.rays, side, 5.0), rtol=1e-4, atol=1e-5)
     np.testing.assert_allclose(surface_patches._normals(got), naive.normals(got.astype(np.float64)), atol=1e-3)
     assert np.isfinite(surface_patches._normals(got)).any()
-    clean = surface_patches._block_points(render(T, boxes=(), room=((0, 0, 0), (80, 80, 9))), KINECT.rays, 4, 20.0)
+    clean = surface_patches._block_points(render(T, boxes=(), room=((0, 0, 0), (80, 80, 9))), KINECT.rays, 4, 20.0, READING)
     xyz_c = clean[20:, :, :3].reshape(-1, 3).astype(float)
     height = se3.transform(T, xyz_c[np.isfinite(xyz_c[:, 0])])[:, 2]
     assert len(height) > 300
@@ -180,7 +180,7 @@ def test_block_points_lie_on_the_surface_and_match_their_slow_twin():
 
 def test_image_gradient_is_the_step_from_the_upper_neighbour():
     frames, _ = seen([look_along([2.0, 2.0, 0.7], 0.4, 0.3)], clean=True)
-    found, _ = surface_patches.collect(frames, KINECT, side=4, max_range=9.0)
+    found, _ = surface_patches.collect(frames, KINECT, side=4, max_range=9.0, noise=READING)
     gradient = floor_paper.image_gradient(found)
     at = {tuple(cell): row for row, cell in enumerate(found.grid.tolist())}
     for row in range(0, len(found.grid), 37):
@@ -206,5 +206,5 @@ def test_fit_plane_minimizes_the_sum_of_distances():
 
 def test_up_is_found_within_a_few_degrees_before_any_floor():
     frames, T_wl = seen(ATTITUDES["level, mostly walls"])
-    up = floor.vertical(*surface_patches.collect(frames, KINECT, side=4, max_range=5.0))
+    up = floor.vertical(*surface_patches.collect(frames, KINECT, side=4, max_range=5.0, noise=READING))
     assert np.degrees(np.arccos(up @ T_wl[:3, 2])) < 1.0

@@ -5,14 +5,14 @@ from dataclasses import replace
 import naive
 import numpy as np
 import pytest
-from boxroom import CUPBOARD, FURNITURE, HANGING, KINECT, LOW, TABLE, kinect_noise, look_along, render, round_trip
+from boxroom import CUPBOARD, FURNITURE, HANGING, KINECT, LOW, READING, TABLE, kinect_noise, look_along, render, round_trip
 
 from slamcli.config.options import GridConfig, SensorConfig
 from slamcli.errors import SlamError
 from slamcli.geometry import se3
 from slamcli.navigation import grid, grid_evidence
 from slamcli.navigation.grid import FREE, OCCUPIED, UNKNOWN, build_grid, decide, fuse, view_probability
-from slamcli.navigation.grid_evidence import View
+from slamcli.navigation.grid_evidence import Sight, View
 
 SETTINGS = GridConfig(stride=1, min_range=0.5, n_low=3, n_high=8)  # of images a quarter as wide as a Kinect's
 SENSOR = SensorConfig()
@@ -135,28 +135,24 @@ def test_band_points_floor_holes_and_tops_match_their_slow_twin():
         depth = kinect_noise(render(T), rng)
         corner, side = np.floor(T[:2, 3] / 0.05) - 85, 171
         T[2, 3] += lift
-        args = (corner, 3, 4, 0.05, 0.5, 4.0, 0.05, 0.5, 0.08, 0.0012, 0.0019)
-        n_band, layers = np.zeros((side, side), np.int32), np.zeros((side, side), np.uint16)
-        floor, hole, top = (np.zeros((side, side), np.uint8) for _ in range(3))
-        grid_evidence._sort_points(depth, KINECT.rays, T, *args, n_band, layers, floor, hole, top)
-        expected = naive.sorted_points(depth, KINECT.rays, T, *args, side)
-        assert n_band.sum() > 100 and (floor.sum() > 100 if lift == 0.0 else min(hole.sum(), top.sum()) > 50)
-        np.testing.assert_array_equal(n_band, expected[0])
-        np.testing.assert_array_equal(layers, expected[1])
-        np.testing.assert_array_equal(floor, expected[2])
-        np.testing.assert_array_equal(hole, expected[3])
-        np.testing.assert_array_equal(top > 0, expected[4])
+        sight, noise = Sight(corner, cell=0.05, near=0.5, far=4.0, low=0.05, high=0.5, drop=0.08), READING
+        seen = grid_evidence.blank_cells(side)
+        grid_evidence._sort_points(depth, KINECT.rays, T, sight, noise, 3, 4, seen)
+        expected = naive.sorted_points(depth, KINECT.rays, T, corner, 3, 4, *sight[1:], *noise, side)
+        assert seen.n_band.sum() > 100 and (seen.floor.sum() > 100 if lift == 0.0 else min(seen.hole.sum(), seen.top.sum()) > 50)
+        for found, twin in zip((*seen[:4], seen.top > 0), expected, strict=True):
+            np.testing.assert_array_equal(found, twin)
 
 
 def test_crossed_slices_match_their_slow_twin():
     T = look_along([1.0, 0.9, 0.6], 0.7, 0.3)
     depth = kinect_noise(render(T), np.random.default_rng(3), far=6.0)
     corner, side = np.floor(T[:2, 3] / 0.05) - 85, 171
-    args = (corner, 5, 0.05, 0.5, 4.0, 0.05, 0.5, 0.0012, 0.0019)
+    sight, noise = Sight(corner, cell=0.05, near=0.5, far=4.0, low=0.05, high=0.5, drop=0.08), READING
     crossed = np.zeros((side, side), np.uint16)
-    grid_evidence._cross(depth, KINECT.rays, T, *args, crossed)
+    grid_evidence._cross(depth, KINECT.rays, T, sight, noise, 5, crossed)
     expected = np.zeros((side, side), np.uint16)
-    for i, j, k in naive.crossed_slices(depth, KINECT.rays, T, *args, side):
+    for i, j, k in naive.crossed_slices(depth, KINECT.rays, T, corner, 5, *sight[1:-1], *noise, side):
         expected[i, j] |= np.uint16(1 << k)
     assert (crossed > 0).sum() > 300
     np.testing.assert_array_equal(crossed, expected)

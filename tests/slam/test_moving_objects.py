@@ -15,7 +15,16 @@ from slamcli.depth import icp
 from slamcli.geometry import se3
 from slamcli.schema import Features, Words
 from slamcli.slam import background_motion_kernels, moving_object_kernels, moving_objects
-from slamcli.slam.background_motion import SWERVE_COST, SWERVE_M, SWERVE_MOST, BackgroundMotion, Judgement, _steadiest, anchor_frames
+from slamcli.slam.background_motion import (
+    FLATNESS,
+    SWERVE_COST,
+    SWERVE_M,
+    SWERVE_MOST,
+    BackgroundMotion,
+    Judgement,
+    _steadiest,
+    anchor_frames,
+)
 from slamcli.slam.moving_objects import STEP, Views
 
 FRAMES, RATE, SPEED = 36, 15.0, 0.6
@@ -136,7 +145,7 @@ def test_the_room_speaks_for_its_own_motion_by_its_extent() -> None:
 
     def explain(T: np.ndarray) -> tuple[float, float]:
         return background_motion_kernels.explain(
-            np.ascontiguousarray(T), source.xyz, source.normal, target.row, target.xyz, target.normal, target.pinhole, 0.015, 0.006
+            np.ascontiguousarray(T), source.xyz, source.normal, target.row, target.xyz, target.normal, target.pinhole, FLATNESS
         )
 
     surface = background_motion_kernels.surface(source.xyz, source.normal, source.pinhole)
