@@ -4,6 +4,7 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
+import option_marks as options
 import pytest
 from click.testing import CliRunner, Result
 from hypothesis import settings
@@ -18,6 +19,11 @@ settings.register_profile("slamcli", deadline=None, derandomize=True)
 settings.load_profile("slamcli")
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Add the check of the tests that show what options do."""
+    parser.addoption("--disconnected", action="store_true", help="with -m shows: name the options that a test does not miss")
+
+
 def pytest_configure(config: pytest.Config) -> None:
     """Compile the kernels once, before several processes begin to test with them."""
     if not hasattr(config, "workerinput"):
@@ -30,6 +36,27 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         for item in items:
             if item.get_closest_marker("slow"):
                 item.add_marker(pytest.mark.skip(reason="slow: set SLAMCLI_SLOW=1 to run it"))
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
+    """Under --disconnected, note which of the options that a test shows it misses where nothing can set them."""
+    if not pyfuncitem.config.getoption("--disconnected"):
+        return None
+    for name in options.shown_by(pyfuncitem):
+        arguments = {key: pyfuncitem.funcargs[key] for key in pyfuncitem._fixtureinfo.argnames}
+        if "tmp_path" in arguments:
+            arguments["tmp_path"] = arguments["tmp_path"] / name
+            arguments["tmp_path"].mkdir()
+        options.note(name, is_missed=options.is_missed(name, lambda arguments=arguments: pyfuncitem.obj(**arguments)))
+    return True
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """Fail where no test missed an option."""
+    if dead := options.not_missed():
+        session.exitstatus = pytest.ExitCode.TESTS_FAILED
+        session.config.get_terminal_writer().line(f"\nno test misses {', '.join(dead)}")
 
 
 @pytest.fixture(autouse=True)

@@ -89,6 +89,7 @@ def test_what_does_not_differ_from_what_was_believed_stays(scene):
     assert all(sigma > 0.0 for sigma in found.sigma.values()) and len(found.sigma) == 7
 
 
+@pytest.mark.shows("optimize.intrinsics")
 def test_intrinsics_that_were_put_in_are_found_within_their_sigma():
     scene, given = turn(0.25, frames=40), replace(CAMERA, fx=523.0, fy=517.0, cx=321.5, cy=238.8)
     found = look(scene, scene.features, given, OptimizeConfig(readout=False, depth_delay=False, intrinsics=True))
@@ -98,6 +99,7 @@ def test_intrinsics_that_were_put_in_are_found_within_their_sigma():
     assert found.sigma["fx"] < 1.0 and found.sigma["cx"] < 1.0 and found.sigma["fy"] > 0.9 * 0.02 * given.fy
 
 
+@pytest.mark.shows("optimize.depth_scale")
 def test_an_offset_of_inverse_depth_is_found_within_its_sigma_and_a_factor_is_said_to_be_unknown():
     scene, offset, factor = turn(0.25, frames=40), 0.02, 0.99
     read = 1.0 / ((1.0 / scene.features.depth - offset) * factor)
@@ -150,7 +152,55 @@ def test_features_under_another_calibration_keep_their_rays_and_return(scene):
     np.testing.assert_allclose(back.xy, scene.features.xy, atol=5e-3)
 
 
+@pytest.mark.shows("optimize.move_depth")
 def test_depth_without_a_delay_to_go_by_stays_where_it_is(scene):
     unmoved = rolling_shutter.rectify(scene.features, moving(scene, readout=0.02, depth_delay=np.nan), CAMERA)
     np.testing.assert_array_equal(unmoved.depth, scene.features.depth)
     assert list(self_calibration.unknowns(CAMERA, OptimizeConfig(move_depth=False))) == ["readout"]
+
+
+@pytest.mark.shows("optimize.readout", "optimize.depth_delay")
+def test_times_that_are_not_looked_for_stay(scene):
+    shaken = rolling_shutter.rectify(scene.features, moving(scene, readout=-0.02, depth_delay=0.01), CAMERA)
+    for option, sought in (
+        (OptimizeConfig(readout=False), {"depth_delay"}),
+        (OptimizeConfig(depth_delay=False), {"readout", "depth_readout"}),
+    ):
+        found = look(scene, shaken, CAMERA, option, rounds=1)
+        assert set(found.sigma) == sought
+        assert all(getattr(found.timing, name) == 0.0 for name in set(self_calibration.TIMES) - sought)
+
+
+@pytest.mark.shows("optimize.focal_prior", "optimize.centre_prior")
+def test_intrinsics_move_no_farther_than_they_are_believed_to_be_off():
+    scene, given = turn(0.25, frames=30), replace(CAMERA, fx=530.0, cx=326.0)
+    option = OptimizeConfig(readout=False, depth_delay=False, intrinsics=True)
+    free = look(scene, scene.features, given, option, rounds=2)
+    sure_of_focal, sure_of_centre = (
+        look(scene, scene.features, given, replace(option, **prior), rounds=2) for prior in ({"focal_prior": 1e-6}, {"centre_prior": 1e-3})
+    )
+    assert abs(free.camera.fx - CAMERA.fx) < 4.0 < 6.0 < abs(free.camera.fx - given.fx)
+    assert abs(sure_of_focal.camera.fx - given.fx) < 0.1 and abs(sure_of_focal.camera.cx - given.cx) > 1.0
+    assert abs(sure_of_centre.camera.cx - given.cx) < 0.1 and abs(sure_of_centre.camera.fx - given.fx) > 1.0
+
+
+@pytest.mark.shows("optimize.inverse_depth_prior", "optimize.depth_scale_prior")
+def test_depth_changes_no_more_than_it_is_believed_to_be_off():
+    scene = turn(0.25, frames=30)
+    shifted = replace(scene.features, depth=(1.0 / (1.0 / scene.features.depth - 0.02)).astype(np.float32))
+    option = OptimizeConfig(readout=False, depth_delay=False, depth_scale=True)
+    free, sure = (
+        look(scene, shifted, CAMERA, replace(option, inverse_depth_prior=prior, depth_scale_prior=prior), rounds=2)
+        for prior in (0.02, 1e-5)
+    )
+    assert free.camera.inverse_depth_offset == pytest.approx(0.02, abs=0.01) and abs(sure.camera.inverse_depth_offset) < 1e-4
+    share = [found.sigma["depth_scale"] / CAMERA.depth_scale for found in (free, sure)]
+    assert share[0] > 0.01 and share[1] == pytest.approx(1e-5, rel=0.1)
+
+
+@pytest.mark.shows("optimize.timing_prior")
+def test_times_move_no_farther_from_0_than_they_are_believed_to_be():
+    scene = shaking()
+    shaken = rolling_shutter.rectify(scene.features, moving(scene, readout=-0.018), CAMERA)
+    free, sure = (look(scene, shaken, CAMERA, OptimizeConfig(timing_prior=prior), rounds=1) for prior in (0.02, 1e-6))
+    assert float(free.timing.readout) > 0.005 and abs(float(sure.timing.readout)) < 1e-4

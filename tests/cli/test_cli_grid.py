@@ -315,6 +315,7 @@ def test_plan_tells_what_a_robot_can_reach(slamcli, run, tmp_path):
     assert slamcli("plan", "--start", "0,0", "-r", run).exit_code == 2
 
 
+@pytest.mark.shows("robot.radius", "robot.mount")
 def test_a_robot_described_once_is_used_by_plan_and_export(slamcli, run, tmp_path):
     folder = RunDir(run)
     before = folder.config()

@@ -45,6 +45,7 @@ def write_large(folder: Path, size: tuple[int, int] = (1920, 1440)) -> Path:
     return folder
 
 
+@pytest.mark.shows("recording.full_size")
 def test_large_pictures_keep_their_rays(tmp_path: Path) -> None:
     folder = write_large(tmp_path / "phone")
     small, large = open_dataset(str(folder)), open_dataset(str(folder), options=RecordingConfig(full_size=True))

@@ -77,6 +77,7 @@ def test_no_floor_in_view_is_said_and_up_is_guessed(name):
     assert (found.T_lw @ frames[0][1])[2, 3] == pytest.approx(0.0, abs=1e-9)
 
 
+@pytest.mark.shows("ground.method")
 def test_a_table_that_fills_the_view_is_the_papers_floor_but_not_ours():
     frames, T_wl = seen(ATTITUDES["over a table"])
     assert abs(error_of(find(frames), T_wl)[1]) < 0.01

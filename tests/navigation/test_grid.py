@@ -115,6 +115,7 @@ def test_the_same_input_gives_the_same_grid():
     assert a.p_occupied.tobytes() == b.p_occupied.tobytes()
 
 
+@pytest.mark.shows("grid2d.extend_down")
 def test_an_upright_surface_that_leaves_the_picture_downwards_reaches_the_floor():
     pillar = ((3.0, 2.0, 0.0), (3.6, 2.6, 2.0))
     T = [look_along([2.0 + 0.02 * i, 2.3, 1.4], 0.0, 0.1) for i in range(6)]  # the picture ends at a height of 0.87 m on its face

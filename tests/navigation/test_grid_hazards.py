@@ -36,6 +36,7 @@ def drive(x0, x1, *, y=2.5, height=0.6, pitch=0.35, step=0.1, yaw=0.0):
     return np.stack([look_along([x, y, height], yaw, pitch) for x in np.arange(x0, x1, step)])
 
 
+@pytest.mark.shows("grid2d.drop")
 @pytest.mark.parametrize("depth", [0.12, 0.5])
 def test_floor_beyond_an_edge_is_not_free(depth):
     upper = ((0.0, 0.0, -depth), (4.0, 5.0, 0.0))

@@ -1,6 +1,7 @@
 """Tracking where texture ends: frames placed by the shape that their depth images show."""
 
 from functools import cache
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from kinect import KINECT, coded, noisy
 from scenes import ape
 
 from slamcli.calibration.self_calibration import Sensing
-from slamcli.config.options import LoopConfig, SensorConfig, TrackConfig
+from slamcli.config.options import LoopConfig, OptimizeConfig, SensorConfig, TrackConfig
 from slamcli.depth import icp
 from slamcli.depth.coarse_images import CoarseImages
 from slamcli.geometry import se3
@@ -19,6 +20,7 @@ from slamcli.slam.depth_tracking import DepthAligner, FramePoints
 from slamcli.slam.tracker import Tracker
 from slamcli.sparse_map import map_adjustment
 from slamcli.sparse_map.sparse_map import SparseMap
+from slamcli.stages import optimize
 
 SENSOR = SensorConfig()
 RATE = 15.0
@@ -105,6 +107,7 @@ def past_a_box(n: int = 16) -> tuple[CoarseImages, np.ndarray]:
     return coded([icp.coarsen(noisy(render(t, KINECT, scene, None), k)) for k, t in enumerate(T)]), T
 
 
+@pytest.mark.shows("track.depth_icp_hold")
 @pytest.mark.parametrize("hold", [0.0, 0.2, 1.0])
 def test_along_a_flat_wall_the_motion_goes_on_for_a_while(hold):
     depth, T_gc = past_a_box()
@@ -207,6 +210,22 @@ def test_a_second_look_joins_key_frames_that_see_the_same_and_moves_them_to_wher
     assert 1e-4 < error < 0.01 if most else error > 0.02
     final_refinement.refine_all(sparse_map, after, sensing, SENSOR, TrackConfig(), depth_icp_edges=most, **look)
     assert len(sparse_map.edge) == {0: 0, 1: 3, 6: 6}[most], "no pair is joined twice"
+
+
+@pytest.mark.shows("optimize.depth_icp_edges")
+@pytest.mark.parametrize(("most", "n_edges"), [(0, 0), (1, 3)])
+def test_optimize_aligns_as_many_depth_images_as_asked(most, n_edges):
+    frames = [0, 2, 4, 6]
+    sparse_map, n = revisit(frames), len(frames)
+    tracks = Tracks(np.arange(n, dtype=np.int32), np.tile(np.eye(4), (n, 1, 1)), np.full(n, KEY_FRAME, np.uint8), np.full(n, 60, np.int32))
+    sensing = Sensing(KINECT, Timing(np.array(0.0), np.array(0.0), np.array(np.nan), np.zeros((n, 6))), {})
+    option = OptimizeConfig(depth_icp_edges=most, readout=False, move_depth=False)
+    optimize.refine(
+        sparse_map, sparse_map.features, tracks, sensing, SimpleNamespace(optimize=option, sensor=SENSOR, track=TrackConfig()),
+        SimpleNamespace(progress=lambda items, *_: items, workers=1),
+        frame_points=FramePoints(CoarseDepth(corner().coarse_depth[frames]), KINECT, SENSOR),
+    )  # fmt: skip
+    assert len(sparse_map.edge) == n_edges
 
 
 def test_key_frames_are_joined_the_same_with_any_number_of_threads():

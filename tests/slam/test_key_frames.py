@@ -27,20 +27,24 @@ def test_a_frame_that_sees_its_reference_well_is_none():
     assert not wants_key_frame(CALM, SETTINGS)
 
 
+@pytest.mark.shows("track.key_frame_share")
 @pytest.mark.parametrize(("n_landmarks", "expected"), [(315, False), (314, True)])  # three quarters of 420
 def test_leaving_the_reference_asks_for_one_exactly_below_its_share(n_landmarks: int, expected: bool):
-    assert wants_key_frame(replace(CALM, n_landmarks=n_landmarks), SETTINGS) == expected
+    assert wants_key_frame(replace(CALM, n_landmarks=n_landmarks), replace(SETTINGS, key_frame_share=0.75)) == expected
 
 
+@pytest.mark.shows("track.key_frame_gap")
 @pytest.mark.parametrize(("frames_since", "expected"), [(29, False), (30, True)])
 def test_a_long_time_asks_for_one(frames_since: int, expected: bool):
-    assert wants_key_frame(replace(CALM, frames_since=frames_since), SETTINGS) == expected
+    assert wants_key_frame(replace(CALM, frames_since=frames_since), replace(SETTINGS, key_frame_gap=30)) == expected
 
 
+@pytest.mark.shows("track.key_frame_crowd")
 @pytest.mark.parametrize("asks", [{"n_landmarks": 100}, {"frames_since": 99}])
 def test_where_enough_stand_already_neither_counts(asks: dict):
-    assert wants_key_frame(replace(CALM, n_crowd=3, **asks), SETTINGS)
-    assert not wants_key_frame(replace(CALM, n_crowd=4, **asks), SETTINGS)
+    crowd_of_four = replace(SETTINGS, key_frame_crowd=4)
+    assert wants_key_frame(replace(CALM, n_crowd=3, **asks), crowd_of_four)
+    assert not wants_key_frame(replace(CALM, n_crowd=4, **asks), crowd_of_four)
 
 
 @pytest.mark.parametrize("n_crowd", [0, 99])

@@ -160,6 +160,7 @@ def test_final_refinement_matches_key_frames_again_and_the_world_stays_where_it_
     assert error[0] > 0.01 and 1e-5 < error[1] < 0.2 * error[0]
 
 
+@pytest.mark.shows("track.depth_icp_below")
 def test_a_key_frame_that_depth_held_keeps_its_pose(turn):
     scene, tracks, map_ = turn
     most = int(tracks.n_inliers.max())

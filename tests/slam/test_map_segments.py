@@ -142,6 +142,7 @@ def test_a_place_known_from_an_earlier_segment_is_recognized(tmp_path):
     assert tracks.state[80] in (RELOCALIZED, 2) and run.summary["track"]["segments"] == 2
 
 
+@pytest.mark.shows("track.segment_after")
 def test_zero_never_begins_a_segment(tmp_path):
     run = Run(scene_of((0.0, 0.2, 30), (0.6, 0.8, 30)), tmp_path)
     run.cfg.track = TrackConfig(segment_after=0)

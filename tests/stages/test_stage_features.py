@@ -90,6 +90,7 @@ def test_camera_and_association_are_written_for_other_programs(room: Path, tmp_p
         assert [float(stamp), float(depth_stamp)] == pytest.approx([dataset.stamp[i], dataset.depth_stamp[i]], abs=1e-6)
 
 
+@pytest.mark.shows("extract.depth_jump")
 def test_key_points_behind_an_outline_have_no_depth(tmp_path: Path) -> None:
     recording = texture_recording(tmp_path / "recording", frames=1)
     (path,) = (recording / "depth").iterdir()
@@ -155,6 +156,7 @@ def test_one_frame_is_enough(tmp_path: Path) -> None:
     assert len(words.word) == features.offset[-1]
 
 
+@pytest.mark.shows("match.window")
 def test_words_and_matches_keep_their_promises(features: Features, tmp_path: Path) -> None:
     words, matches, summary = run_match(features, tmp_path / "match", window=3)
     n_frames = len(features.stamp)
@@ -174,6 +176,7 @@ def test_words_and_matches_keep_their_promises(features: Features, tmp_path: Pat
         assert weight.sum() == pytest.approx(1.0, abs=1e-4)
 
 
+@pytest.mark.shows("match.method")
 def test_words_find_nearly_what_brute_force_finds(features: Features, tmp_path: Path) -> None:
     by_word, brute = (run_match(features, tmp_path / method, method=method)[1] for method in ("words", "brute"))
     found = {(p, *row) for p in range(len(brute.pair)) for row in by_word.row[by_word.offset[p] : by_word.offset[p + 1]].tolist()}
@@ -184,6 +187,7 @@ def test_words_find_nearly_what_brute_force_finds(features: Features, tmp_path: 
     np.testing.assert_array_equal(rows, brute.row[brute.offset[4] : brute.offset[5]])
 
 
+@pytest.mark.shows("extract.flow", "match.flow_below")
 def test_flow_adds_matches_only_where_descriptors_give_few(room: Path, tmp_path: Path) -> None:
     features, _, _ = run_extract(room, tmp_path / "extract", features=200, flow=True)
     flow = artifacts.load(Flow, tmp_path / "extract")

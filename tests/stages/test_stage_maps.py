@@ -220,6 +220,7 @@ def test_the_octrees_file_is_a_small_part_of_the_clouds(done: Done) -> None:
     assert size["octree/map.bt"] < 0.1 * size["octree/map.ot"]
 
 
+@pytest.mark.shows("densify.method")
 def test_a_surface_by_integration_is_as_good(recording: Path, distance, tmp_path: Path) -> None:
     volume = replace(CFG, densify=replace(CFG.densify, method="tsdf", voxel=0.03))
     run = run_both(recording, tmp_path, volume)
