@@ -21,6 +21,8 @@ INTRINSICS_FILES = (
 NEEDED = ("fx", "fy", "cx", "cy")
 CAMERA_KEYS = frozenset(field.name for field in fields(Camera))
 DEFAULT_DEPTH_SCALE = 1000.0  # millimetres: what nearly all recorders write
+UNLIKE = 0.15  # by which the shares of the principal point differ that no other size of the picture explains
+POWER_OF_TWO = 0.1  # octaves within which a size is taken to be halved or doubled
 OFF_CENTRE = 0.3  # share of a picture's side within which a principal point lies from the middle, if its size is right
 
 
@@ -134,7 +136,8 @@ def _sized(values: dict[str, Any], size: tuple[int, int], source: str) -> dict[s
     except (TypeError, ValueError):
         shares = np.array([0.5, 0.5])  # the camera says what is wrong with them
     factor = 0.5 / float(shares.mean()) if shares.mean() > 0 else 1.0
-    if (np.abs(shares - 0.5) < OFF_CENTRE / 2).all() or abs(shares[0] / max(shares[1], 1e-9) - 1.0) > 0.15:
+    if (np.abs(shares - 0.5) < OFF_CENTRE / 2).all() or abs(shares[0] / max(shares[1], 1e-9) - 1.0) > UNLIKE:
         return {**values, "width": size[0], "height": size[1]}
-    step = 2.0 ** round(float(np.log2(factor))) if abs(np.log2(factor) - round(float(np.log2(factor)))) < 0.1 else factor
+    octaves = float(np.log2(factor))
+    step = 2.0 ** round(octaves) if abs(octaves - round(octaves)) < POWER_OF_TWO else factor
     return {**values, "width": round(size[0] / step), "height": round(size[1] / step)}

@@ -18,6 +18,8 @@ ENOUGH = 8  # stamps from which regularity can be judged
 SESSION = 10  # frames that a session has at least
 INTERLEAVED = 5  # frames of one session between those of another that sorting would mix up
 SESSION_PAUSE = 1.0  # [s] put between sessions whose clocks began anew
+MOSTLY_ONE = 0.8  # share of the steps that are one, of whole seconds
+MULTIPLES, ALIKE = 0.9, 0.6  # shares of the steps that are multiples of the usual one, and equal to it, of frame numbers
 LARGEST_NUMBER_STEP = 10  # frame numbers advance by this at most
 RATES = (1.0, 300.0)  # [Hz] that whole seconds may show
 NEAR_ROLL_OVER = 2.5  # steps from the top, and to the bottom, within which a counter rolls over
@@ -119,7 +121,7 @@ def _numbers(raw: np.ndarray, what: str, fps: float | None) -> Clock:
 def _repeated(raw: np.ndarray, what: str, fps: float | None) -> Clock:
     """Read stamps of which many are equal: whole seconds tell the rate, anything else does not."""
     values, counts = np.unique(raw, return_counts=True)
-    is_counting = len(values) >= 4 and (np.diff(raw) >= 0).all() and (np.diff(values) == 1).mean() > 0.8
+    is_counting = len(values) >= 4 and (np.diff(raw) >= 0).all() and (np.diff(values) == 1).mean() > MOSTLY_ONE
     rate = float(counts[1:-1].mean()) if is_counting else 0.0
     if fps is None and RATES[0] <= rate <= RATES[1]:
         message = f"{what}: stamps are whole seconds; {rate:.1f} Hz taken from how many frames share one, in the list's order"
@@ -157,7 +159,9 @@ def _are_frame_numbers(raw: np.ndarray) -> bool:
         return False
     step = np.diff(np.unique(raw))
     typical = float(np.median(step))
-    return 1.0 <= typical <= LARGEST_NUMBER_STEP and bool((step % typical == 0).mean() > 0.9) and float((step == typical).mean()) > 0.6
+    return (
+        1.0 <= typical <= LARGEST_NUMBER_STEP and bool((step % typical == 0).mean() > MULTIPLES) and float((step == typical).mean()) > ALIKE
+    )
 
 
 def _is_regular(raw: np.ndarray) -> bool:

@@ -13,6 +13,7 @@ from slamcli.formats.trajectory import write_tum
 from slamcli.geometry.camera import DEPTH_VALUES
 
 DEPTH_SCALE = 5000.0
+COARSEST = 100.0  # units a metre: of a smaller depth scale whole numbers say too little
 MOST_WARNINGS = 20
 
 
@@ -24,7 +25,7 @@ def write_tum_layout(dataset: Dataset, out: Path, *, progress: Progress = silent
     """
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise SlamError(f"{out}: exists already; name a new folder")
-    scale = dataset.camera.depth_scale if dataset.camera.depth_scale >= 100.0 else DEPTH_SCALE
+    scale = dataset.camera.depth_scale if dataset.camera.depth_scale >= COARSEST else DEPTH_SCALE
     lists: dict[str, list[str]] = {"rgb": [], "depth": []}
     warnings: list[str] = []
     with staged(out) as staging:

@@ -32,6 +32,9 @@ FACTORS = (4.0, 5.0, 10.0)  # by which a scale is off when it is wrong: millimet
 FINEST_WHOLE_UNIT = 50.0  # depth units per metre from which readings are whole numbers
 MILLIMETRES = 1000.0
 DEPTH_STEP = 4  # every fourth row and column of a depth image is counted
+OFF_BY = 0.06  # by which a ratio of scales may differ from such a factor
+RARE, RARE_SHARE = 3.0, 1e-7  # pixels, and their share of all: values that fewer have are errors
+DOUBLE = 1.6  # times the usual step: a reading that does not occur leaves a double one
 WINDOWS = np.geomspace(100.0, 60000.0, 64)  # raw readings between which steps are looked for
 LEAST_VALUES = 5  # different readings within a window
 LEAST_WINDOWS = 5
@@ -115,13 +118,13 @@ def measure(counts: np.ndarray) -> tuple[float | None, str]:
 
 def disparity_constant(counts: np.ndarray) -> float | None:
     """Measure u q = v^2 / step in raw units; None where the readings do not come in steps that grow with the square of the distance."""
-    used = np.flatnonzero(counts > max(3.0, 1e-7 * counts.sum()))
+    used = np.flatnonzero(counts > max(RARE, RARE_SHARE * counts.sum()))
     constants = []
     for low, high in zip(WINDOWS[:-1], WINDOWS[1:], strict=True):
         values = used[(used >= low) & (used < high)].astype(np.float64)
         if len(values) >= LEAST_VALUES:
             step = np.diff(values)
-            usual = step[step < 1.6 * np.median(step)]  # a reading that does not occur leaves a double step
+            usual = step[step < DOUBLE * np.median(step)]
             if usual.mean() >= LEAST_STEP:
                 constants.append(float(np.median(values)) ** 2 / float(usual.mean()))
     if len(constants) < LEAST_WINDOWS:
@@ -152,7 +155,7 @@ def _likely_scale(constant: float, scale: float, *, typical: float) -> float | N
     """
     for other in COMMON_SCALES:
         ratio = max(other / scale, scale / other)
-        is_usual = any(abs(ratio / factor - 1.0) < 0.06 for factor in FACTORS)
+        is_usual = any(abs(ratio / factor - 1.0) < OFF_BY for factor in FACTORS)
         if is_usual and _camera_of(constant / other) and TYPICAL[0] <= typical * scale / other <= TYPICAL[1]:
             return other
     return None

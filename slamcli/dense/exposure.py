@@ -20,6 +20,8 @@ PRIOR = 1.0 / 0.4054651081081644  # 1 / log 1.5: a gain differs from 1 by a half
 NOISE = 0.1  # of a logarithm: texture within a voxel, shading
 ROUNDS = 6  # of re-weighting
 TUKEY = 4.685  # robust deviations at which a sample no longer counts, for 95 % efficiency
+MAD = 1.4826  # standard deviations in a median of absolute deviations
+LEAST_DEVIATION, LEAST_WEIGHT = 1e-3, 1e-4  # of a logarithm, and of a sample: the fit stays determined
 HALF_EXTENT = 1 << 20  # voxels
 
 
@@ -80,8 +82,8 @@ def fit_log_gains(of_frame: np.ndarray, of_voxel: np.ndarray, log_colour: np.nda
             evened = value + gain[of_frame, channel]
             middle = np.bincount(of_voxel, weights=weight * evened, minlength=n_voxels) / per_voxel
             residual = np.abs(evened - middle[of_voxel])
-            scale = TUKEY * max(1.4826 * float(np.median(residual)), 1e-3)
-            weight = np.square(np.maximum(1.0 - np.square(residual / scale), 1e-4)) / NOISE**2
+            scale = TUKEY * max(MAD * float(np.median(residual)), LEAST_DEVIATION)
+            weight = np.square(np.maximum(1.0 - np.square(residual / scale), LEAST_WEIGHT)) / NOISE**2
     return gain - gain.mean(axis=0)
 
 

@@ -32,6 +32,7 @@ HUBER_CHI2 = 4.0
 READINGS_AS_ONE = 500.0
 # [m, rad] how far the start is believed to be off: next to nothing beside what depth says, and all there is where it says nothing.
 START_SIGMA = np.array([0.2, 0.2, 0.2, 0.2, 0.2, 0.2])
+DIRECTIONS = 6  # of motion
 DETERMINED_SIGMA = 0.01  # [m] a direction known to this at the mean depth is determined; noise alone feigns 0.015 to 0.03 over planes
 
 

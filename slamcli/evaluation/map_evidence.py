@@ -18,10 +18,14 @@ UPWARD = 0.9  # cosine: the normal of a floor point from the vertical
 LEAST_FLOOR = 0.01  # share of a view's pixels that show floor, or the view has not seen it
 SAMPLED = 16  # every so many points of a view are compared with other views
 SAME_SURFACE = 0.9  # cosine between the normals of two points of one surface
-THICKNESS = 0.03  # [m] two points of one surface lie within this, three sigma of both readings added
+THICKNESS, THICKNESS_SIGMAS = 0.03, 3.0  # [m] two points of one surface lie within this, so many sigma of both readings added
 FARTHEST_TWIN = 0.6  # [m] from a surface to its double; what is farther apart is two things
 LEAST_TWIN = 0.02  # share of a view's pixels in which another shows a surface standing in free space
 FLAT = 0.04  # [m] points of a flat wall lie within this of a plane, twice the noise added
+NOISE_SIGMAS = 2.0  # twice the noise
+FEWEST = 10  # sampled points that a wall is judged by
+SAME_WAY = 0.2  # cosine between the axes of two views that may show one surface
+NEAREST = 0.1  # [m] before the other camera, from where on a point can be seen in its image
 PATH_SQUARE = 0.5  # [m] about a robot's width
 UPRIGHT = 0.5  # cosine of a wall's normal to the vertical at most
 
@@ -100,22 +104,26 @@ def known_share(grid: Grid, xyz_l: np.ndarray) -> float:
 def sees_floor(view: View, *, max_range: float) -> bool:
     """Tell whether a view shows enough of the floor, within `max_range` [m] of the camera, for the grid to learn from it."""
     sigma = np.sqrt(view.surface.variance)
-    is_floor = (np.abs(view.xyz_l[:, 2]) < FLOOR_BAND + 2.0 * sigma) & (view.normal_l[:, 2] > UPWARD) & (view.surface.xyz[:, 2] < max_range)
+    is_floor = (
+        (np.abs(view.xyz_l[:, 2]) < FLOOR_BAND + NOISE_SIGMAS * sigma)
+        & (view.normal_l[:, 2] > UPWARD)
+        & (view.surface.xyz[:, 2] < max_range)
+    )
     return bool(is_floor.sum() >= LEAST_FLOOR * view.surface.row.size)
 
 
 def is_flat_wall(view: View, *, least: float = 0.9) -> bool:
     """Tell whether one upright plane holds at least the share `least` of what a view shows."""
     xyz, normal = view.xyz_l[::SAMPLED], view.normal_l[::SAMPLED]
-    sigma = 2.0 * np.sqrt(view.surface.variance[::SAMPLED])
-    if len(xyz) < 10:
+    sigma = NOISE_SIGMAS * np.sqrt(view.surface.variance[::SAMPLED])
+    if len(xyz) < FEWEST:
         return False
     on_plane = np.ones(len(xyz), dtype=bool)
     for _ in range(4):
         middle, n = np.median(xyz[on_plane], axis=0), normal[on_plane].mean(axis=0)
         n /= max(np.linalg.norm(n), 1e-9)
         on_plane = np.abs((xyz - middle) @ n) < FLAT + sigma
-        if on_plane.sum() < 10:
+        if on_plane.sum() < FEWEST:
             return False
     return bool(on_plane.mean() >= least and abs(n[2]) < UPRIGHT)
 
@@ -141,7 +149,7 @@ def compare(source: View, target: View) -> tuple[int, np.ndarray]:
     """
     nothing = 0, np.zeros(0)
     T_ts = se3.inverse(target.T_lc) @ source.T_lc
-    if T_ts[2, 2] < 0.2 or not len(source.surface) or not len(target.surface):  # they look apart
+    if T_ts[2, 2] < SAME_WAY or not len(source.surface) or not len(target.surface):  # they look apart
         return nothing
     xyz = se3.transform(T_ts, source.surface.xyz[::SAMPLED].astype(np.float64))
     normal, z = source.surface.normal[::SAMPLED] @ T_ts[:3, :3].T, xyz[:, 2]
@@ -150,7 +158,7 @@ def compare(source: View, target: View) -> tuple[int, np.ndarray]:
     with np.errstate(divide="ignore", invalid="ignore"):
         column, row = np.rint(xyz[:, 0] / z * fx + cx), np.rint(xyz[:, 1] / z * fy + cy)
     height, width = target.surface.row.shape
-    is_in = (z > 0.1) & (row >= 0) & (column >= 0) & (row < height) & (column < width)
+    is_in = (z > NEAREST) & (row >= 0) & (column >= 0) & (row < height) & (column < width)
     if not is_in.any():
         return nothing
     met = target.surface.row[row[is_in].astype(np.int64), column[is_in].astype(np.int64)]
@@ -159,5 +167,5 @@ def compare(source: View, target: View) -> tuple[int, np.ndarray]:
     n = target.surface.normal[met]
     in_front = ((xyz - target.surface.xyz[met]) * n).sum(axis=1)
     is_same = (normal * n).sum(axis=1) > SAME_SURFACE
-    limit = THICKNESS + 3.0 * (sigma + np.sqrt(target.surface.variance[met]))
+    limit = THICKNESS + THICKNESS_SIGMAS * (sigma + np.sqrt(target.surface.variance[met]))
     return int((is_same & (np.abs(in_front) < limit)).sum()), in_front[is_same & (in_front >= limit) & (in_front < FARTHEST_TWIN)]

@@ -19,6 +19,9 @@ LARGEST = 1e9  # of any of the numbers below: beyond, it is no camera and its sq
 MAX_INVERSE_DEPTH_OFFSET = 0.1  # [1/m]; a Kinect's is some thousandths
 POLYNOMIAL, EQUIDISTANT = "polynomial", "equidistant"  # values of Camera.lens
 LATER_FIELDS = {"k4": 0.0, "k5": 0.0, "k6": 0.0, "lens": POLYNOMIAL}  # written only where they say something
+LARGEST_SIDE = 16384  # [px]
+FOCAL_LENGTHS = (0.1, 20.0)  # shares of the width: 157 degrees across, and 3
+DEPTH_SCALES = (1.0, 1e6)  # units a metre
 SHAPE_TOLERANCE = 0.01  # by which width and height may be scaled differently: sizes are rounded
 
 
@@ -54,11 +57,11 @@ class Camera:
                 raise SlamError(f"camera.{name} = {shown}: must be a finite number")
         for name in ("width", "height"):
             size = getattr(self, name)
-            if size != int(size) or not 1 <= size <= 16384:
-                raise SlamError(f"camera.{name} = {size}: must be a whole number from 1 to 16384")
+            if size != int(size) or not 1 <= size <= LARGEST_SIDE:
+                raise SlamError(f"camera.{name} = {size}: must be a whole number from 1 to {LARGEST_SIDE}")
         for name in ("fx", "fy"):
             focal = getattr(self, name)
-            if not 0.1 * self.width <= focal <= 20 * self.width:
+            if not FOCAL_LENGTHS[0] * self.width <= focal <= FOCAL_LENGTHS[1] * self.width:
                 raise SlamError(f"camera.{name} = {focal:g}: not a focal length in pixels of an image {self.width} wide")
         for name in DISTORTION:
             if not abs(getattr(self, name)) <= MAX_DISTORTION:
@@ -66,7 +69,7 @@ class Camera:
         for name, size in (("cx", self.width), ("cy", self.height)):
             if not 0.0 <= getattr(self, name) <= size:
                 raise SlamError(f"camera.{name} = {getattr(self, name):g}: the principal point is outside the image (0 to {size})")
-        if not 1.0 <= self.depth_scale <= 1e6:
+        if not DEPTH_SCALES[0] <= self.depth_scale <= DEPTH_SCALES[1]:
             raise SlamError(f"camera.depth_scale = {self.depth_scale:g}: must be depth units per metre, such as 5000 or 1000")
         if not abs(self.inverse_depth_offset) <= MAX_INVERSE_DEPTH_OFFSET:
             limit = f"{MAX_INVERSE_DEPTH_OFFSET:g} 1/m at most either way"

@@ -4,7 +4,7 @@ import numpy as np
 
 from slamcli.errors import SlamError
 from slamcli.geometry import elementary
-from slamcli.navigation.planner import end_cell, obstacle_distance
+from slamcli.navigation.planner import LARGEST, end_cell, obstacle_distance
 from slamcli.schema import Grid
 
 LETHAL, INSCRIBED, NEAREST = 100, 99, 98  # an obstacle; the robot would touch; the cost just beyond, which falls off from there
@@ -21,8 +21,8 @@ def inflated(grid: Grid, *, radius: float, reach: float, falloff: float) -> np.n
     falloff : 1/m, how fast the cost falls: its `cost_scaling_factor`
     """
     for name, value in (("radius", radius), ("reach", reach), ("falloff", falloff)):
-        if not (np.isfinite(value) and 0.0 <= value <= 100.0):
-            raise SlamError(f"{name} = {value:g}: must be from 0 to 100")
+        if not (np.isfinite(value) and 0.0 <= value <= LARGEST):
+            raise SlamError(f"{name} = {value:g}: must be from 0 to {LARGEST:g}")
     distance = obstacle_distance(grid, allow_unknown=True)
     cost = np.rint(NEAREST * elementary.exp(-falloff * np.maximum(distance - radius, 0.0)))
     cost = np.where(distance > reach, 0, np.where(distance < radius, INSCRIBED, cost))

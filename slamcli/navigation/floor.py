@@ -25,6 +25,11 @@ PARALLEL = 0.985  # cosine: within 10 degrees of a direction
 ORTHOGONAL = 0.17  # cosine: within 10 degrees of a right angle
 MAX_NORMALS = 20000  # used for the vertical: more cost time and change nothing
 LEVEL_BIN = 0.02  # [m] height histogram
+BELOW = 0.1  # [m] what lies deeper than this below a plane says that the room goes on there
+INLIER_SIGMAS, BELOW_SIGMAS = 2.0, 3.0  # of a patch, by which an inlier may be off, and a patch must be to lie below
+NO_HEADING = 0.2  # sine: a camera that looks nearer to the vertical has its images' up for a heading
+NO_DIRECTION = 1e-3  # length of a mean of unit vectors that cancel out
+DRAWN_CLOSER = (0.94, 0.97, PARALLEL, PARALLEL)  # cosines, round by round, of the normals that a direction is the mean of
 PEAK_HALF_WIDTH = 0.12  # [m] first guess of a plane's inliers; takes up 2 degrees of tilt over some 3 m
 
 
@@ -111,7 +116,7 @@ def _suits_camera(up: np.ndarray, T_wk: np.ndarray) -> bool:
 
 def _unit(vector: np.ndarray, otherwise: np.ndarray) -> np.ndarray:
     length = np.linalg.norm(vector, axis=-1)
-    return vector / length if length > 1e-3 else otherwise
+    return vector / length if length > NO_DIRECTION else otherwise
 
 
 def _frequent_directions(normal: np.ndarray, *, count: int = 24) -> list[np.ndarray]:
@@ -126,7 +131,7 @@ def _frequent_directions(normal: np.ndarray, *, count: int = 24) -> list[np.ndar
         if not members.any():
             break
         direction = (normal[members] * np.where(bins[members] < 0, -1.0, 1.0)[:, None]).sum(axis=0)
-        for least in (0.94, 0.97, PARALLEL, PARALLEL):
+        for least in DRAWN_CLOSER:
             cosine = product(normal, direction / np.linalg.norm(direction, axis=-1))
             near = np.abs(cosine) > least
             direction = (normal[near] * np.sign(cosine[near])[:, None]).sum(axis=0)
@@ -155,7 +160,7 @@ def _refined(patches: Patches, rows: np.ndarray, plane: np.ndarray, least: float
     inliers = rows
     for half_width in (PEAK_HALF_WIDTH, 0.5 * PEAK_HALF_WIDTH, settings.distance, settings.distance):
         residual = product(patches.xyz[rows], plane[:3]) + plane[3]
-        inliers = rows[np.abs(residual) < half_width + 2.0 * patches.sigma[rows]]
+        inliers = rows[np.abs(residual) < half_width + INLIER_SIGMAS * patches.sigma[rows]]
         if len(inliers) < least:
             return None
         plane = fit_plane(patches.xyz[inliers], 1.0 / patches.sigma[inliers], plane)
@@ -176,7 +181,7 @@ def _levels(height: np.ndarray, least: float) -> np.ndarray:
 def _nothing_below(patches: Patches, support: Support, settings: GroundConfig) -> bool:
     """Say whether hardly anything lies below a plane: under a table top the room goes on."""
     height = product(patches.xyz, support.plane[:3]) + support.plane[3]
-    below = np.count_nonzero(height < -0.1 - 3.0 * patches.sigma)
+    below = np.count_nonzero(height < -BELOW - BELOW_SIGMAS * patches.sigma)
     return bool(below <= settings.max_below * len(support.inliers))
 
 
@@ -184,7 +189,7 @@ def level_frame(plane: np.ndarray, T_wc: np.ndarray) -> np.ndarray:
     """Return T_lw (4, 4): z along the plane's normal, z = 0 on it, origin below the camera T_wc, x along that camera's heading."""
     up = plane[:3]
     heading = T_wc[:3, 2] - product(T_wc[:3, 2], up) * up
-    if np.linalg.norm(heading, axis=-1) < 0.2:  # looking straight down: the image's up is ahead
+    if np.linalg.norm(heading, axis=-1) < NO_HEADING:  # looking straight down: the image's up is ahead
         heading = -T_wc[:3, 1] + product(T_wc[:3, 1], up) * up
     x = heading / np.linalg.norm(heading, axis=-1)
     T_lw = np.eye(4)

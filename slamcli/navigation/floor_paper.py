@@ -14,6 +14,7 @@ from slamcli.navigation.surface_patches import Patches, Support, fit_plane
 CLASSES = 3  # most frequent gradients kept
 GROUND_SHARE = 0.3  # of the key frames, those with the most ground are the ground key frames
 FACES_UP = 0.9  # cosine
+ON_A_LINE = 1e-6  # [m^2] twice the area of the triangle of three points that fix no plane
 
 
 def paper_plane(patches: Patches, up: np.ndarray, *, settings: GroundConfig, rng: np.random.Generator) -> Support | None:
@@ -79,7 +80,7 @@ def _plane_through(xyz: np.ndarray) -> np.ndarray | None:
     """Return the plane (4,) through three points (3, 3), None where they lie on a line."""
     normal = np.cross(xyz[1] - xyz[0], xyz[2] - xyz[0])
     length = np.linalg.norm(normal, axis=-1)
-    if length < 1e-6:
+    if length < ON_A_LINE:
         return None
     normal = normal / length
     return np.append(normal, product(-normal, xyz[0]))

@@ -21,6 +21,10 @@ HOLE_POINTS = 2  # readings through the floor's plane that make a cell a hole: o
 ROWS = 120  # of an image: a surface is level by a pixel this share above; a nearer one would show the noise instead of the slope
 OPEN_STRIDE = 3  # open lines of sight are followed at every so many of the pixels whose points are sorted
 NOISE_SIGMAS = 2.0  # that a reading may be off: a point's height, and the end of a line of sight
+LEVEL = 1e-9  # slope of a line of sight that never leaves the height it begins at
+FARTHEST_CELL = 1e8  # cells from the origin: beyond, numbers of cells are no longer exact
+LOWEST, UPRIGHT_SPAN = 16, 12  # of an image's rows: one in so many at its lower edge, and from there up, tell what leaves the picture
+UPRIGHT_SLOPE = 3.0  # height over distance, between the ends of the span, of a surface that is upright
 TOP_REACH = 0.3  # [m] above the band: what is seen there from above may be the top of something that reaches into the band
 
 
@@ -74,7 +78,7 @@ def look(depth: np.ndarray, rays: np.ndarray, T_lk: np.ndarray, *, settings: Gri
     """
     cell, half = settings.resolution, int(np.ceil(settings.max_range / settings.resolution)) + 1
     centre = np.floor(T_lk[:2, 3] / cell)
-    if not (np.abs(centre) < 1e8).all():
+    if not (np.abs(centre) < FARTHEST_CELL).all():
         raise SlamError("grid2d: a key frame lies absurdly far away; check the trajectory")
     side = 2 * half + 1
     seen, crossed = blank_cells(side), np.zeros((side, side), dtype=np.uint16)
@@ -188,7 +192,7 @@ def _cross(depth: f4[:, ::1], rays: f4[:, :, ::1], T: f8[:, ::1], sight: Sight, 
             first, last = near, z - NOISE_SIGMAS * depth_noise.sigma(z, noise) - cell
             if last > far:
                 last = far
-            if abs(dz) > 1e-9:
+            if abs(dz) > LEVEL:
                 a, b = (low - T[2, 3]) / dz, (high - T[2, 3]) / dz
                 if a > b:
                     a, b = b, a
@@ -221,12 +225,12 @@ def _extend_down(
     """
     height, width = depth.shape
     u = np.arange(s.stride // 2, width, s.stride)
-    lowest = depth[height - height // 16 :, u][::-1]
+    lowest = depth[height - height // LOWEST :, u][::-1]
     is_reading = (lowest >= s.min_range) & (lowest <= s.max_range)
     u, v = u[is_reading.any(axis=0)], height - 1 - is_reading.argmax(axis=0)[is_reading.any(axis=0)]
-    at, above = (se3.transform(T_lk, np.column_stack([depth[v, u, None] * rays[v, u], depth[v, u]])) for v in (v, v - height // 12))
+    at, above = (se3.transform(T_lk, np.column_stack([depth[v, u, None] * rays[v, u], depth[v, u]])) for v in (v, v - height // UPRIGHT_SPAN))
     step = np.abs(at - above)
-    is_upright = (at[:, 2] >= s.band_high) & (step[:, 2] > 3.0 * np.linalg.norm(step[:, :2], axis=1))
+    is_upright = (at[:, 2] >= s.band_high) & (step[:, 2] > UPRIGHT_SLOPE * np.linalg.norm(step[:, :2], axis=1))
     j, i = np.floor(at[is_upright, :2] / s.resolution - corner).astype(np.int64).T
     inside = (i >= 0) & (j >= 0) & (i < n_band.shape[0]) & (j < n_band.shape[1])
     np.add.at(n_band, (i[inside], j[inside]), 1)

@@ -17,6 +17,7 @@ from slamcli.navigation.tight_path import dense, pull_tight
 from slamcli.schema import Grid
 
 HALF_DIAGONAL = 0.5 * 2.0**0.5
+LARGEST = 100.0  # [m] of a radius or a clearance, and of a weight
 
 
 @dataclass(frozen=True)
@@ -40,8 +41,8 @@ def plan(
     Raises SlamError for a start or goal outside the grid or not free, and when no way leads from one to the other.
     """
     for name, value, least in (("radius", radius, 0.0), ("clearance", clearance, 0.0), ("weight", weight, 0.0)):
-        if not (np.isfinite(value) and least <= value <= 100.0):
-            raise SlamError(f"{name} = {value:g}: must be from {least:g} to 100")
+        if not (np.isfinite(value) and least <= value <= LARGEST):
+            raise SlamError(f"{name} = {value:g}: must be from {least:g} to {LARGEST:g}")
     margin = obstacle_distance(grid, allow_unknown=allow_unknown) - radius
     ends = [end_cell(grid, margin, name, xy, radius) for name, xy in (("start", start), ("goal", goal))]
     cost = _cell_cost(margin, clearance, weight)

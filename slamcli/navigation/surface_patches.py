@@ -10,6 +10,10 @@ from slamcli.geometry.algebra import eigh, product
 from slamcli.geometry.camera import Camera
 from slamcli.geometry.depth_noise import DepthNoise
 
+# Depth within one patch [m, share of the depth]: a floor seen at a flat angle spans much, so the bound is wide; it only rejects edges.
+SPREAD, SPREAD_SHARE = 0.02, 0.1
+JUMP = 0.15  # of the depth, between the patches to either side of one: more, and they show two things
+SMOOTHED = 1e-3  # [m] below which distances to a plane count as squares
 MAX_FRAMES = 256  # key frames kept; of more, every second one goes: bounds memory, and a floor needs no more
 
 
@@ -80,8 +84,7 @@ def _block_points(depth: np.ndarray, rays: np.ndarray, side: int, max_range: flo
     z[~has] = np.nan
     n = has.sum(axis=0)
     low, high = np.fmin.reduce(z, axis=0), np.fmax.reduce(z, axis=0)
-    # A block on a floor seen at a flat angle spans much depth, so the bound on the spread is wide; it only rejects edges.
-    is_one = (2 * n >= len(z)) & (high - low <= 0.02 + 0.1 * low)
+    is_one = (2 * n >= len(z)) & (high - low <= SPREAD + SPREAD_SHARE * low)
     n, has = n[is_one], has[:, is_one]
     z = n / np.where(has, 1.0 / z[:, is_one], 0.0).sum(axis=0)
     x, y = (z * np.where(has, _samples(rays[..., k], side)[:, is_one], 0.0).sum(axis=0, dtype=np.float64) / n for k in range(2))
@@ -107,7 +110,7 @@ def _normals(points: np.ndarray) -> np.ndarray:
     b = points[2:, 1:-1, :3] - points[:-2, 1:-1, :3]
     normal = np.cross(b, a)
     length = np.sqrt(np.einsum("rck,rck->rc", normal, normal))
-    reach = 0.15 * middle[..., 2]
+    reach = JUMP * middle[..., 2]
     is_smooth = (np.abs(a[..., 2]) < reach) & (np.abs(b[..., 2]) < reach) & (length > 0.0)
     faces_away = (normal * middle).sum(axis=-1) > 0.0
     length = np.where(faces_away, -length, length)
@@ -120,7 +123,7 @@ def fit_plane(xyz: np.ndarray, weight: np.ndarray, start: np.ndarray, *, rounds:
     plane = start
     for _ in range(rounds):
         residual = np.abs(product(xyz, plane[:3]) + plane[3])
-        w = weight / np.maximum(residual, 1e-3)  # sum w r^2 is then the sum of distances, smoothed below 1 mm
+        w = weight / np.maximum(residual, SMOOTHED)  # sum w r^2 is then the sum of distances
         w = w / w.sum()
         mean = product(w, xyz)
         centred = xyz - mean

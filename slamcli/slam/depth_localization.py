@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from slamcli.config.options import TrackConfig
+from slamcli.depth import icp
 from slamcli.depth.icp import PosePrior
 from slamcli.geometry import se3
 from slamcli.slam import background_prior
@@ -64,9 +65,9 @@ class DepthLocalizer:
         placed = self._search(i, frame, expected) if found is None else self._confirm(i, found)
         if placed is None or not placed.is_sound:
             return None
-        is_anchored = placed.n_determined == 6
+        is_anchored = placed.n_determined == icp.DIRECTIONS
         if not is_anchored:
-            poses.lost_reason[i] = f"the depth shows {placed.n_determined} of 6 directions only: a flat wall"
+            poses.lost_reason[i] = f"the depth shows {placed.n_determined} of {icp.DIRECTIONS} directions only: a flat wall"
             if found is not None or stamp[i] - stamp[poses.anchored] > self._settings.depth_icp_hold:
                 return None
             placed = self._aligner.place(i, placed.kf, [expected], PosePrior(expected, self._steady))
@@ -110,7 +111,7 @@ class DepthLocalizer:
         starts : T_cw, the first as expected, which counts as measured where the background's motion says so
         """
         placed = self._aligner.place(i, kf, starts, PosePrior(starts[0], self._steady) if self._poses.has_background else None)
-        if placed is not None and placed.is_sound and placed.n_determined < 6:
+        if placed is not None and placed.is_sound and placed.n_determined < icp.DIRECTIONS:
             few = self._match_few(frame, placed)
             if few is not None:
                 placed = self._aligner.place(i, kf, [placed.T_cw], PosePrior(few.estimate.T_cw, few.estimate.information))
@@ -127,4 +128,4 @@ class DepthLocalizer:
 
 
 def _is_determined(placed: Placement | None) -> bool:
-    return placed is not None and placed.n_determined == 6
+    return placed is not None and placed.n_determined == icp.DIRECTIONS

@@ -137,7 +137,7 @@ class DepthAligner:
         if here is None or there is None:
             return False
         found = icp.align(np.eye(4), here, there)
-        return found.agreement >= MIN_AGREEMENT and icp.n_determined(found.information, found.depth) == 6
+        return found.agreement >= MIN_AGREEMENT and icp.n_determined(found.information, found.depth) == icp.DIRECTIONS
 
     def join(self, kf: int) -> int:
         """Add edges between a key frame and the earlier ones around that show the same; returns how many."""
@@ -177,7 +177,11 @@ class DepthAligner:
         if target is None or source is None:
             return None
         found = icp.align(product(se3.inverse(product(table.T_wk[kf_i], T_i)), table.T_wk[kf_j], T_j), source, target)
-        if found.agreement < MIN_AGREEMENT or found.overlap < JOIN_OVERLAP or icp.n_determined(found.information, found.depth) < 6:
+        if (
+            found.agreement < MIN_AGREEMENT
+            or found.overlap < JOIN_OVERLAP
+            or icp.n_determined(found.information, found.depth) < icp.DIRECTIONS
+        ):
             return None
         to_depth = se3.adjoint(se3.inverse(T_i))
         return kf_i, kf_j, product(T_i, found.T_ij, se3.inverse(T_j)), product(to_depth.T, found.information, to_depth)

@@ -11,6 +11,7 @@ from slamcli.geometry.camera import Camera
 from slamcli.jit.kernel import kernel
 
 CELL = 20  # px, side of the buckets that features are sorted into
+NEAREST = 0.05  # [m] before the camera, from where on a landmark is looked for
 LAST_OCTAVE = 9  # in which a landmark is looked for; one that should appear beyond it is too far away
 
 
@@ -154,7 +155,7 @@ def _search(
     for k in range(n_lm):
         x, y, z = xyz[k, 0], xyz[k, 1], xyz[k, 2]
         depth = T_cw[2, 0] * x + T_cw[2, 1] * y + T_cw[2, 2] * z + T_cw[2, 3]
-        if not depth > 0.05:
+        if not depth > NEAREST:
             continue
         u = fx * (T_cw[0, 0] * x + T_cw[0, 1] * y + T_cw[0, 2] * z + T_cw[0, 3]) / depth + cx
         v = fy * (T_cw[1, 0] * x + T_cw[1, 1] * y + T_cw[1, 2] * z + T_cw[1, 3]) / depth + cy

@@ -10,6 +10,9 @@ from slamcli.schema import Features, Map
 from slamcli.sparse_map.guided_matching import Landmarks
 from slamcli.sparse_map.table import Table
 
+# Views beyond the latest add nothing to a landmark's mean direction and would make its medoid quadratic in its life.
+LATEST_VIEWS = 16
+
 
 class SparseMap:
     """Key frames and landmarks with their observations, as flat tables.
@@ -371,14 +374,13 @@ def _refresh(
     direction: f8[:, ::1],
     reach: f8[::1],
 ):
-    # Views beyond the latest 16 add nothing to the mean direction and would make the medoid quadratic in a landmark's life.
-    rows = np.empty(16, dtype=np.int64)
+    rows = np.empty(LATEST_VIEWS, dtype=np.int64)
     for lm in ids:
         n = 0
         sx = sy = sz = 0.0
         nearest = np.inf
         o = head[lm]
-        while o >= 0 and n < 16:
+        while o >= 0 and n < LATEST_VIEWS:
             if obs_kf[o] >= 0:
                 kf = obs_kf[o]
                 dx, dy, dz = xyz[lm, 0] - T_wk[kf, 0, 3], xyz[lm, 1] - T_wk[kf, 1, 3], xyz[lm, 2] - T_wk[kf, 2, 3]

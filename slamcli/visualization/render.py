@@ -18,6 +18,8 @@ BACKGROUND = (232, 235, 240)  # off white, against which white walls show
 PATH_COLOUR = (214, 39, 40)
 OVERSAMPLING = 2  # per side; edges come out smooth
 SPLAT = 1.4  # width of a point's square over the points' spacing: closes the gaps on surfaces seen aslant
+NEAREST = 0.01  # [m] before the camera, from where on things are drawn
+SEAM = 1e-4  # share of a triangle by which it reaches beyond its sides, so that no gap shows between two
 FILL = 0.94  # share of the picture that the scene takes
 STRAY_SHARE = 0.002  # of the points may lie outside the picture
 MAX_CELLS = 20_000_000  # of an octree, once it is split into its finest cells
@@ -192,7 +194,7 @@ def _splat(pixel, rgb, width_at_1m, image, z_buffer):
     rows, columns = z_buffer.shape
     for i in range(len(pixel)):
         z = pixel[i, 2]
-        if not z > 0.01:
+        if not z > NEAREST:
             continue
         half = max(0.5, 0.5 * width_at_1m / z)
         u0, u1 = max(0, int(np.ceil(pixel[i, 0] - half))), min(columns - 1, int(np.floor(pixel[i, 0] + half)))
@@ -213,7 +215,7 @@ def _fill_triangles(corner, rgb, image, z_buffer):
         bx, by, bz = corner[i, 1, 0], corner[i, 1, 1], corner[i, 1, 2]
         cx, cy, cz = corner[i, 2, 0], corner[i, 2, 1], corner[i, 2, 2]
         area = (bx - ax) * (cy - ay) - (cx - ax) * (by - ay)
-        if area == 0.0 or not min(az, min(bz, cz)) > 0.01:
+        if area == 0.0 or not min(az, min(bz, cz)) > NEAREST:
             continue
         u0, u1 = max(0, int(np.ceil(min(ax, min(bx, cx))))), min(columns - 1, int(np.floor(max(ax, max(bx, cx)))))
         v0, v1 = max(0, int(np.ceil(min(ay, min(by, cy))))), min(rows - 1, int(np.floor(max(ay, max(by, cy)))))
@@ -222,7 +224,7 @@ def _fill_triangles(corner, rgb, image, z_buffer):
                 wa = ((bx - u) * (cy - v) - (cx - u) * (by - v)) / area
                 wb = ((cx - u) * (ay - v) - (ax - u) * (cy - v)) / area
                 wc = 1.0 - wa - wb
-                if wa < -1e-4 or wb < -1e-4 or wc < -1e-4:
+                if wa < -SEAM or wb < -SEAM or wc < -SEAM:
                     continue
                 z = 1.0 / (wa / az + wb / bz + wc / cz)
                 if z < z_buffer[v, u]:

@@ -248,7 +248,7 @@ def shared(**settings) -> int:
     kf, added = growth.insert(5, frame, scene.T_gc[5], known, 0)
     before = int(sparse_map.lm.n_obs[: added.max() + 1].sum())
     alive = int(sparse_map.lm.is_alive[: added.max() + 1].sum())
-    growth._share(kf, added)
+    growth._share_with_neighbours(kf, added)
     after = int(sparse_map.lm.n_obs[: added.max() + 1].sum())
     return (alive - int(sparse_map.lm.is_alive[: added.max() + 1].sum())) + max(after - before, 0)
 
