@@ -145,7 +145,15 @@ def _unit(raw: np.ndarray) -> tuple[str, bool]:
     typical = float(np.median(step))
     unit = _unit_of_epoch(raw)
     if unit is None:
-        unit = "s" if typical < SLOWEST_STEP else "ms" if typical < 1e3 * SLOWEST_STEP else "us" if typical < 1e6 * SLOWEST_STEP else "ns"
+        unit = (
+            "s"
+            if typical < SLOWEST_STEP
+            else "ms"
+            if typical < UNITS["ms"] * SLOWEST_STEP
+            else "us"
+            if typical < UNITS["us"] * SLOWEST_STEP
+            else "ns"
+        )
     return unit, typical / UNITS[unit] >= FASTEST
 
 

@@ -13,6 +13,7 @@ from slamcli.errors import SlamError
 from slamcli.geometry.algebra import product
 from slamcli.geometry.camera import EQUIDISTANT
 
+NOT_SQUARE, MIRRORED = 1e-3, 0.9  # by which a matrix differs from a rotation at most; its determinant at least
 MAX_BYTES = 1 << 20
 KEYS = "width height fx fy cx cy k1 k2 p1 p2 k3 depth_scale inverse_depth_offset k4 k5 k6 lens"
 DEPTH_KEYS = frozenset(["width", "height", "fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "lens"])
@@ -201,8 +202,8 @@ def _pose(depth: Mapping[str, Any], path: Path) -> np.ndarray | None:
     elif len(rotation) == 9:
         T_cd[:3, :3], T_cd[:3, 3] = np.array(rotation).reshape(3, 3), translation
     if (
-        np.abs(product(T_cd[:3, :3], T_cd[:3, :3].T) - np.eye(3)).max() > 1e-3
-        or not product(np.cross(T_cd[:3, 0], T_cd[:3, 1]), T_cd[:3, 2]) > 0.9
+        np.abs(product(T_cd[:3, :3], T_cd[:3, :3].T) - np.eye(3)).max() > NOT_SQUARE
+        or not product(np.cross(T_cd[:3, 0], T_cd[:3, 1]), T_cd[:3, 2]) > MIRRORED
     ):
         raise SlamError(f"{path}: the rotation of the depth camera is none")
     return T_cd

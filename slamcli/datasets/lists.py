@@ -22,6 +22,7 @@ STAMP_FIRST = (
 )
 STAMP_LAST = re.compile(rf"\s*(\S.*?)\s*[,;\s]\s*[\"']?({DECIMAL_COMMA}|{NUMBER})[\"']?\s*$", re.IGNORECASE)
 WHOLE_NUMBER = re.compile(rf"[\"']?({DECIMAL_COMMA}|{NUMBER})[\"']?$", re.IGNORECASE)
+EARLIEST, NANOSECONDS = 5e8, 1e9  # [s] since 1970 of any recording; in a second
 POSE_COLUMNS = 8  # stamp tx ty tz qx qy qz qw
 
 
@@ -171,7 +172,7 @@ def _number_first(text: str) -> re.Match | None:
 
 
 def _is_nanoseconds(seconds: float, rest: float) -> bool:
-    return seconds > 5e8 and seconds == int(seconds) and 0 <= rest < 1e9 and rest == int(rest)
+    return seconds > EARLIEST and seconds == int(seconds) and 0 <= rest < NANOSECONDS and rest == int(rest)
 
 
 def _pair_row(tokens: list[str]) -> tuple[list[float], list[str], list[float], list[float]] | None:

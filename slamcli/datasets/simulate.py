@@ -27,6 +27,7 @@ TEXEL_AT_640 = 0.004  # [m] finest texture pixel for images 640 px wide: what su
 MAX_TEXELS = 30e6
 PATH_MARGIN = 1.35  # [m] of the robot's round from the walls
 MOST_PEOPLE = 20
+SIDES = (4.0, 50.0)  # [m] of a room: the furniture needs so much, the textures fill the memory
 AROUND_TRAJECTORY = 1.6  # [m] from a given trajectory to the walls
 PNG_SETTINGS = [cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_SUB]
 
@@ -165,8 +166,8 @@ def _check(what: Simulation) -> None:
         raise SlamError(f"activities: {unknown[0]!r} is unknown; known are {', '.join(people.ACTIVITIES)}")
     if what.depth_min >= what.depth_max:
         raise SlamError(f"depth_min = {what.depth_min}, depth_max = {what.depth_max}: the first must be smaller")
-    if min(what.room) < 4.0 or max(what.room) > 50.0:
-        raise SlamError(f"room = {what.room}: sides must be from 4 to 50 m")
+    if min(what.room) < SIDES[0] or max(what.room) > SIDES[1]:
+        raise SlamError(f"room = {what.room}: sides must be from {SIDES[0]:g} to {SIDES[1]:g} m")
 
 
 def _write_lists(folder: Path, what: Simulation, scene: Scene, motion: Motion, figures: list[Figure], shares: np.ndarray) -> None:
