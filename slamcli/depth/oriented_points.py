@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from numba import f4, f8, i4, i8
@@ -15,7 +16,21 @@ from slamcli.jit.kernel import kernel
 JUMP_SIGMA = 4.0  # a depth step is a jump from this many sigma on, beyond what the steepest slope allowed would give
 PAIR_SIGMA = 3.0  # a pair of pixels agrees with the one between when their mean is within this many sigma
 MIN_PAIRS = 3  # that must agree for a reading to be on a surface
+NEAREST = 1e-3  # [m] a depth of 0 would be infinitely near
 MAX_WINDOW = 6  # px; beyond, smoothing costs time and takes detail
+
+
+class Sought(NamedTuple):
+    """Which pixels of a depth image are looked at, and what counts as a surface."""
+
+    stride: i8  # every stride-th row and column
+    near: f8  # [m] at less than half of this depth, every second or fourth of these
+    edge: i8  # [px] from a depth jump, within which readings are dropped
+    window: f8  # [px/m] half width of the smoothing window, per metre of distance
+    low: f8  # [1/m] inverse of the greatest depth
+    high: f8  # [1/m] inverse of the least
+    min_cosine: f8  # between the normal and the ray
+    steepest: f8  # [1/px] relative change of depth from pixel to pixel that this allows
 
 
 @dataclass(frozen=True)
@@ -55,23 +70,18 @@ def surface(
     out = Surface(np.empty(n, np.int32), np.empty((n, 3), np.float32), np.empty((n, 3), np.float32), np.empty(n, np.float32))
     with np.errstate(divide="ignore"):  # a depth of 0 has no place here, and is left out as infinitely near
         inverse = 1.0 / np.asarray(depth, dtype=np.float32)
-    n = _find_surface(
-        inverse,
-        _rays(camera),
-        stride,
-        spacing * max(camera.fx, camera.fy) / stride,
-        settings.edge,
-        settings.window,
-        1.0 / depth_max,
-        1.0 / max(depth_min, 1e-3),
-        noise,
-        elementary.cos(np.radians(settings.max_angle_deg)),
-        elementary.tan(np.radians(settings.max_angle_deg)) / camera.fx,
-        out.pixel,
-        out.xyz_c,
-        out.normal_c,
-        out.weight,
+    steepest = float(np.radians(settings.max_angle_deg))
+    sought = Sought(
+        stride=stride,
+        near=float(spacing * max(camera.fx, camera.fy) / stride),
+        edge=settings.edge,
+        window=float(settings.window),
+        low=1.0 / depth_max,
+        high=1.0 / max(depth_min, NEAREST),
+        min_cosine=float(elementary.cos(steepest)),
+        steepest=float(elementary.tan(steepest)) / camera.fx,
     )
+    n = _find_surface(inverse, _rays(camera), sought, noise, out.pixel, out.xyz_c, out.normal_c, out.weight)
     return Surface(out.pixel[:n], out.xyz_c[:n], out.normal_c[:n], out.weight[:n])
 
 
@@ -85,21 +95,15 @@ def _rays(camera: Camera) -> np.ndarray:
 def _find_surface(
     inverse: f4[:, ::1],
     rays: f4[:, :, ::1],
-    stride: i8,
-    near: f8,
-    edge: i8,
-    window: f8,
-    low: f8,
-    high: f8,
+    sought: Sought,
     noise: DepthNoise,
-    min_cosine: f8,
-    steepest: f8,
     pixel: i4[::1],
     xyz_c: f4[:, ::1],
     normal_c: f4[:, ::1],
     weight: f4[::1],
 ):
     """Fill the surface's pixels, points, normals and weights; returns their number. Missing readings are NaN and fail every test."""
+    stride, near, edge, window, low, high, min_cosine, steepest = sought
     height, width = inverse.shape
     n = 0
     for v in range(max(stride // 2, 1), height - 1, stride):

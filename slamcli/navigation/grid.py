@@ -8,6 +8,7 @@ sight passed under nothing that may reach as far as the point. The second pass a
 import math
 from collections.abc import Iterable
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numba import b1, f8, i4, i8, u2
@@ -79,19 +80,19 @@ def fuse(views: Iterable[View], *, settings: GridConfig) -> Grid:
     sights = [_sight(view, low, settings) for view in views]
     hangs, nothing = np.zeros(shape, dtype=np.uint16), np.zeros(shape, dtype=np.int32)
     for view, sight in zip(views, sights, strict=True):
-        is_floor = (view.floor != NOT_SEEN) & ~is_hole[sight[:2]]
+        is_floor = (view.floor != NOT_SEEN) & ~is_hole[sight.rows, sight.columns]
         is_free = is_floor.copy()
-        _drop_hidden(is_free, outline, is_open, hangs, nothing, nothing, *sight)
+        _drop_hidden(is_free, outline, is_open, hangs, nothing, nothing, sight)
         is_under = is_floor & ~is_free
-        n_under[sight[0][is_under], sight[1][is_under]] += 1
-        n_top[sight[0][view.is_top], sight[1][view.is_top]] += 1
+        n_under[sight.rows[is_under], sight.columns[is_under]] += 1
+        n_top[sight.rows[view.is_top], sight.columns[view.is_top]] += 1
     things = hanging.find(standing & hangs, widest=DEEPEST / settings.resolution)
     update = paper_update if settings.update == "paper" else evidence_update
     for view, sight in zip(views, sights, strict=True):
-        is_free = (view.floor != NOT_SEEN) & ~is_hole[sight[:2]]
-        _drop_hidden(is_free, outline, is_open, hangs, things.face, things.around, *sight)
+        is_free = (view.floor != NOT_SEEN) & ~is_hole[sight.rows, sight.columns]
+        _drop_hidden(is_free, outline, is_open, hangs, things.face, things.around, sight)
         told = is_free | (view.n_band >= settings.n_low)
-        update(p_empty, n_seen, sight[0][told], sight[1][told], view.n_band[told], settings)
+        update(p_empty, n_seen, sight.rows[told], sight.columns[told], view.n_band[told], settings)
     p_occupied = (1.0 - p_empty).astype(np.float32)
     state = decide(p_occupied, low=settings.m_low, high=settings.m_high)
     body = hanging.bodies(things, is_under=(n_under >= 2) & (state == UNKNOWN), is_top=n_top > 0)
@@ -99,11 +100,25 @@ def fuse(views: Iterable[View], *, settings: GridConfig) -> Grid:
     return Grid(p_occupied, n_seen, state, origin=low * settings.resolution, resolution=np.array(settings.resolution))
 
 
-def _sight(view: View, low: np.ndarray, settings: GridConfig) -> tuple:
-    """Return a view's cells and camera as `_drop_hidden` takes them: rows, columns, x, y [cells], z, band and reach."""
+class CellSights(NamedTuple):
+    """The lines of sight from one camera to cells of the grid."""
+
+    rows: i8[::1]  # (N,)
+    columns: i8[::1]  # (N,)
+    x: f8  # of the camera [cells]
+    y: f8
+    z: f8  # [m]
+    low: f8  # [m] of the robot's height band
+    high: f8  # [m]
+    reach: f8  # [cells] how far something that hangs may go on
+
+
+def _sight(view: View, low: np.ndarray, settings: GridConfig) -> CellSights:
+    """Return the lines of sight to a view's cells."""
     x, y = view.camera[:2] / settings.resolution - low
-    cells = view.cell[:, 1] - low[1], view.cell[:, 0] - low[0]
-    return *cells, x, y, view.camera[2], settings.band_low, settings.band_high, DEEPEST / settings.resolution
+    rows, columns = view.cell[:, 1] - low[1], view.cell[:, 0] - low[0]
+    band = settings.band_low, settings.band_high
+    return CellSights(rows, columns, x, y, view.camera[2], *band, reach=DEEPEST / settings.resolution)
 
 
 def _without_crossings(views: Iterable[View], resolution: float) -> tuple[list[View], "Crossings"]:
@@ -227,22 +242,17 @@ def _drop_hidden(
     hangs: u2[:, ::1],
     face: i4[:, ::1],
     around: i4[:, ::1],
-    rows: i8[::1],
-    columns: i8[::1],
-    camera_x: f8,
-    camera_y: f8,
-    camera_z: f8,
-    low: f8,
-    high: f8,
-    reach: f8,
+    sight: CellSights,
 ):
     """Clear `is_free` (N,) of each cell whose floor's line of sight to the camera passes under something that hangs into the band.
 
     It passes under something in a cell where slices above the line are filled, while those around the line are not: a line that goes
     through filled slices only grazes the cell's corner, or what stood there has moved. A line may pass over a low box: what is above
     the line beyond the box was open to view. What hangs does not reach as far as the floor's cell if lines of sight crossed that cell at
-    its heights, `is_open` (H, W), or if it is the face of a thing (H, W) of known outline that is not `around` it. The slices that hide are added to `hangs` (H, W).
+    its heights, `is_open` (H, W), or if it is the face of a thing (H, W) of known outline that is not `around` it. The slices that hide
+    are added to `hangs` (H, W).
     """
+    rows, columns, camera_x, camera_y, camera_z, low, high, reach = sight
     for n in range(len(rows)):
         if not is_free[n]:
             continue

@@ -169,7 +169,7 @@ def test_lines_of_sight_match_their_slow_twin():
     for camera in ((10.3, 20.7, 0.6), (-5.0, 60.0, 1.4), (25.5, 20.5, 0.3)):
         got, hangs = np.arange(len(rows)) % 7 > 0, np.zeros((40, 50), np.uint16)
         was_hidden = ~got
-        grid._drop_hidden(got, standing, is_open, hangs, face, around, rows, columns, *camera, 0.05, 0.5, 20.0)
+        grid._drop_hidden(got, standing, is_open, hangs, face, around, grid.CellSights(rows, columns, *camera, 0.05, 0.5, 20.0))
         expected = np.array(
             [naive.is_clear(standing, is_open, face, around, r, c, *camera, 0.05, 0.5, 20.0) for r, c in zip(rows, columns, strict=True)]
         )
