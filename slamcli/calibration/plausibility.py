@@ -15,7 +15,7 @@ from slamcli.calibration import self_calibration
 from slamcli.calibration.self_calibration import Sensing
 from slamcli.config.options import SensorConfig
 from slamcli.depth import noise_model
-from slamcli.geometry import elementary
+from slamcli.geometry import depth_noise, elementary
 from slamcli.geometry.algebra import nearest_rotation, product
 from slamcli.geometry.camera import Camera
 from slamcli.sparse_map.sparse_map import SparseMap
@@ -129,9 +129,8 @@ def _misfit(a: Seen, b: Seen, camera: Camera, sensor: SensorConfig) -> np.ndarra
     if is_near.sum() < SHARED:
         return None
     x = [camera.backproject(seen.xy[is_near], seen.depth[is_near]) for seen in (a, b)]
-    sigma = np.linalg.norm(
-        [noise_model.depth_sigma(p[:, 2], base=sensor.depth_noise_base, quadratic=sensor.depth_noise_quadratic) for p in x], axis=0
-    )
+    noise = noise_model.depth_noise(sensor)
+    sigma = np.linalg.norm([depth_noise.sigmas(p[:, 2], noise) for p in x], axis=0)
     stretch = np.stack([FACTORS, FACTORS, np.ones_like(FACTORS)], axis=1)[:, None]
     misfit = np.zeros((len(FACTORS), int(is_near.sum())))
     for _ in range(ROUNDS):  # false matches lose their weight

@@ -34,6 +34,7 @@ MILLIMETRES = 1000.0
 DEPTH_STEP = 4  # every fourth row and column of a depth image is counted
 OFF_BY = 0.06  # by which a ratio of scales may differ from such a factor
 RARE, RARE_SHARE = 3.0, 1e-7  # pixels, and their share of all: values that fewer have are errors
+ROUNDED = 40.0  # of two digits: above, only multiples of 5 are likely to have been chosen
 DOUBLE = 1.6  # times the usual step: a reading that does not occur leaves a double one
 WINDOWS = np.geomspace(100.0, 60000.0, 64)  # raw readings between which steps are looked for
 LEAST_VALUES = 5  # different readings within a window
@@ -144,7 +145,7 @@ def _is_near_a_camera(q: float) -> bool:
 def _round_scale(scale: float) -> float:
     """Round to a number that somebody would have chosen: two digits, the second a 0 or a 5 above 40."""
     unit = 10.0 ** (math.floor(math.log10(scale)) - 1)
-    step = 5.0 if scale / unit > 40.0 else 1.0
+    step = 5.0 if scale / unit > ROUNDED else 1.0
     return float(round(scale / unit / step) * step * unit)
 
 
