@@ -228,7 +228,9 @@ def _extend_down(
     lowest = depth[height - height // LOWEST :, u][::-1]
     is_reading = (lowest >= s.min_range) & (lowest <= s.max_range)
     u, v = u[is_reading.any(axis=0)], height - 1 - is_reading.argmax(axis=0)[is_reading.any(axis=0)]
-    at, above = (se3.transform(T_lk, np.column_stack([depth[v, u, None] * rays[v, u], depth[v, u]])) for v in (v, v - height // UPRIGHT_SPAN))
+    at, above = (
+        se3.transform(T_lk, np.column_stack([depth[v, u, None] * rays[v, u], depth[v, u]])) for v in (v, v - height // UPRIGHT_SPAN)
+    )
     step = np.abs(at - above)
     is_upright = (at[:, 2] >= s.band_high) & (step[:, 2] > UPRIGHT_SLOPE * np.linalg.norm(step[:, :2], axis=1))
     j, i = np.floor(at[is_upright, :2] / s.resolution - corner).astype(np.int64).T

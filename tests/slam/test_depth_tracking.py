@@ -223,7 +223,7 @@ def test_optimize_aligns_as_many_depth_images_as_asked(most, n_edges):
     optimize.refine(
         sparse_map, sparse_map.features, tracks, sensing, SimpleNamespace(optimize=option, sensor=SENSOR, track=TrackConfig()),
         SimpleNamespace(progress=lambda items, *_: items, workers=1),
-        frame_points=FramePoints(CoarseDepth(corner().coarse_depth[frames]), KINECT, SENSOR),
+        frame_points=FramePoints(coded([corner()[frame] for frame in frames]), KINECT, SENSOR),
     )  # fmt: skip
     assert len(sparse_map.edge) == n_edges
 
