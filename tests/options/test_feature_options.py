@@ -129,6 +129,9 @@ class OneFrame:
     def __init__(self, depth: np.ndarray) -> None:
         self._depth = depth
 
+    def __len__(self) -> int:
+        return 1
+
     def grey(self, i: int) -> np.ndarray:
         return tiles()
 
@@ -162,6 +165,13 @@ def matched(features: Features, out: Path, *, flow: Flow | None = None, **settin
     return artifacts.load(Words, out), artifacts.load(Matches, out)
 
 
+def distances(features: Features, matches: Matches) -> np.ndarray:
+    """Hamming distances of all matches."""
+    of_match = np.repeat(np.arange(len(matches.pair)), np.diff(matches.offset))
+    rows = np.asarray(features.offset)[np.asarray(matches.pair)[of_match]] + matches.row
+    return np.unpackbits(features.desc[rows[:, 0]] ^ features.desc[rows[:, 1]], axis=1).sum(axis=1)
+
+
 def seen(*, flipped_bits: int = 20, seed: int = 0) -> Features:
     rng = np.random.default_rng(seed)
     return observe(sweep(4, length=0.1), room_points(1500, rng), rng, flipped_bits=flipped_bits, per_frame=150).features
@@ -181,7 +191,8 @@ def test_fewer_features_share_a_node_farther_down_and_more_with_a_margin(tmp_pat
 
 @pytest.mark.shows("match.max_distance")
 def test_no_match_is_farther_apart_than_allowed(tmp_path: Path) -> None:
-    near_, far = (matched(seen(), tmp_path / str(n), max_distance=n)[1].distance for n in (30, 64))
+    features = seen()
+    near_, far = (distances(features, matched(features, tmp_path / str(n), max_distance=n)[1]) for n in (30, 64))
     assert near_.max() <= 30 < far.max() <= 64 and 0 < len(near_) < len(far)
 
 

@@ -13,6 +13,7 @@ from boxroom import KINECT, kinect_noise, look_along
 from slamcli import artifacts
 from slamcli.config.options import Config, GridConfig, SensorConfig
 from slamcli.depth import icp
+from slamcli.depth.coarse_images import encode
 from slamcli.formats import octomap
 from slamcli.geometry.octree import DEPTH, Octree
 from slamcli.navigation import grid
@@ -150,7 +151,7 @@ class Drive:
             Tracks: Tracks(ref, np.linalg.inv(self.T_lc[0]) @ self.T_lc, none, none),
             Timing: Timing(np.array(0.0), np.array(0.0), np.array(0.0), np.zeros((n, 6))),
             Moving: Moving(),
-            CoarseDepth: CoarseDepth(np.stack([icp.coarsen(image) for image in images])),
+            CoarseDepth: encode([icp.coarsen(image) for image in images], icp.coarse_shape(KINECT)),
         }
         self.dataset = Recording(images=images, camera=KINECT, depth=lambda i, camera: images[i])
 

@@ -10,7 +10,7 @@ from scenes import CAMERA, Scene, ape, observe, orbit, room_points
 
 from slamcli.config.options import LoopConfig, OptimizeConfig, SensorConfig
 from slamcli.geometry import se3
-from slamcli.schema import KEY_FRAME, Map, Moving, Timing, Tracks
+from slamcli.schema import KEY_FRAME, Map, Moving, Rests, Timing, Tracks
 from slamcli.slam import final_refinement, loop_candidates, loop_pose_graph, loop_verification
 from slamcli.slam.loop_candidates import Candidate
 from slamcli.slam.loop_closing import LoopCloser
@@ -225,6 +225,7 @@ class Lap(Run):
             Tracks: Tracks(kf, np.tile(np.eye(4), (N, 1, 1)), np.full(N, KEY_FRAME, np.uint8), n_inliers),
             Timing: Timing(np.array(0.0), np.array(0.0), np.array(0.0), np.zeros((N, 6))),
             Moving: Moving(),
+            Rests: Rests(),
         }
 
     def load(self, cls, stage):

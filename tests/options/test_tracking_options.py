@@ -222,6 +222,24 @@ def test_what_moves_is_looked_for_or_not(is_on: bool, tmp_path, monkeypatch: pyt
     assert len(asked) == is_on and len(NOTHING.moving) == 0
 
 
+@pytest.mark.shows("track.rests")
+@pytest.mark.parametrize("is_on", [True, False])
+def test_where_the_camera_stands_still_it_is_tracked_once_or_throughout(is_on: bool, tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from scene_run import Run
+
+    from slamcli import artifacts
+    from slamcli.schema import Rests, Tracks
+
+    scene = seen(n=5)
+    monkeypatch.setattr(track_stage.moving_parts, "still", lambda inputs, moving: (scene.features, inputs.depth))
+    monkeypatch.setattr(track_stage.rests, "find", lambda *given: Rests(np.array([[1, 3]], np.int32)))
+    run = Run(scene, tmp_path)
+    run.cfg.track = TrackConfig(rests=is_on, moving_objects=False)
+    track_stage.run(run, tmp_path, run.cfg, run)
+    T_kc, ref_kf = artifacts.load(Tracks, tmp_path).T_kc, artifacts.load(Tracks, tmp_path).ref_kf
+    assert (ref_kf[1] == ref_kf[2] and (T_kc[1] == T_kc[2]).all()) == is_on
+
+
 # track: the map grows
 
 

@@ -128,8 +128,9 @@ def test_frames_that_cannot_be_used_are_skipped_and_counted(tmp_path: Path) -> N
     assert np.isnan(features.depth_stamp[[1, 2, 4]]).all() and np.isfinite(features.depth_stamp[[0, 3, 5]]).all()
     for frame in (2, 4):
         assert np.isnan(features.depth[features.offset[frame] : features.offset[frame + 1]]).all()
-    assert summary["bad_images"] == len(warnings) == 3
-    assert colour[1].name in warnings[0] and "frame 1" in warnings[0]
+    of_frames = [warning for warning in warnings if warning.startswith("frame ")]
+    assert summary["bad_images"] == len(of_frames) == 3
+    assert colour[1].name in of_frames[0] and "frame 1" in of_frames[0]
     words, matches, _ = run_match(features, tmp_path / "match")
     assert np.diff(words.word_offset)[1] == 0
     assert len(matches.pair) == 5 and np.diff(matches.offset)[[0, 1]].tolist() == [0, 0]
