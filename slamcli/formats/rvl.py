@@ -20,7 +20,7 @@ def decode(data: bytes, width: int, height: int) -> np.ndarray:
     n = width * height
     if not 0 < n <= min(MAX_PIXELS, len(data) * MOST_PIXELS_PER_BYTE):
         raise SlamError(f"RVL image of {width} x {height} px cannot be right")
-    padded = np.frombuffer(data + bytes(-len(data) % 4), dtype=np.uint8)
+    padded = np.frombuffer(bytearray(data) + bytes(-len(data) % 4), dtype=np.uint8)  # writable, as `unpack` is compiled for
     out = np.zeros(n, dtype=np.uint16)
     if unpack(padded, out) != n:
         raise SlamError("RVL image is damaged or cut off")

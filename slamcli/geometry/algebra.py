@@ -5,11 +5,18 @@ Here a sum runs in the order of its index and every operation is rounded by itse
 """
 
 import numpy as np
+import numpy.typing as npt
 from numba import float64 as f8
 
 from slamcli.jit.kernel import kernel
 
 MAX_SWEEPS = 30  # of Jacobi's method, which converges quadratically: 6 to 10 are needed
+
+
+def for_kernel(a: npt.ArrayLike) -> np.ndarray:
+    """Return an array as kernels are compiled for: float64, in C's order, writable, which arrays mapped from files are not."""
+    a = np.ascontiguousarray(a, dtype=np.float64)
+    return a if a.flags.writeable else a.copy()
 
 
 def product(*factors: np.ndarray) -> np.ndarray:
@@ -38,10 +45,10 @@ def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 def _flat(a: np.ndarray, stack: tuple[int, ...]) -> np.ndarray:
     """Return the matrices as (1, m, n), where all are the same, or (N, m, n)."""
     if a.ndim == 2:
-        return np.ascontiguousarray(a)[None]
+        return for_kernel(a)[None]
     if a.shape[:-2] != stack:
         a = np.broadcast_to(a, (*stack, *a.shape[-2:]))
-    return np.ascontiguousarray(a).reshape(-1, *a.shape[-2:])
+    return for_kernel(a).reshape(-1, *a.shape[-2:])
 
 
 @kernel
@@ -209,7 +216,7 @@ def nearest_rotation(M: np.ndarray) -> np.ndarray:
     M = np.asarray(M, dtype=np.float64)
     out = np.empty(M.shape)
     if out.size:
-        _nearest_rotations(np.ascontiguousarray(M).reshape(-1, 3, 3), out.reshape(-1, 3, 3))
+        _nearest_rotations(for_kernel(M).reshape(-1, 3, 3), out.reshape(-1, 3, 3))
     return out
 
 

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import float64 as f8
 
+from slamcli.geometry.algebra import for_kernel
 from slamcli.jit.kernel import kernel
 
 HALF_PI_1, HALF_PI_2, HALF_PI_3 = 1.57079632673412561417, 6.07710050630396597660e-11, 2.02226624879595063154e-21  # their sum, 119 bits
@@ -213,7 +214,7 @@ def _arctangents2(y: f8[::1], x: f8[::1], out: f8[::1]):
 
 def _each(kernel: Callable[..., None], *values: npt.ArrayLike) -> np.ndarray:
     arrays = np.broadcast_arrays(*(np.asarray(value, dtype=np.float64) for value in values)) if len(values) > 1 else values
-    flat = [np.ascontiguousarray(array, dtype=np.float64).ravel() for array in arrays]
+    flat = [for_kernel(array).ravel() for array in arrays]
     out = np.empty(np.shape(arrays[0]))
     kernel(*flat, out.reshape(-1))
     return out[()]  # a number where it is one

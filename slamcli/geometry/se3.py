@@ -9,7 +9,7 @@ from numba import float64 as f8
 
 from slamcli.errors import SlamError
 from slamcli.geometry import elementary
-from slamcli.geometry.algebra import eigh, nearest_rotation, product
+from slamcli.geometry.algebra import eigh, for_kernel, nearest_rotation, product
 from slamcli.jit.kernel import kernel
 
 LINE = 1e-14  # squared ratio of the second extent of points to the first, below which rounding hides which line they leave
@@ -29,7 +29,7 @@ def inverse(T_ab: np.ndarray) -> np.ndarray:
     """Invert rigid motions (..., 4, 4) by transposing the rotation."""
     T_ab = np.asarray(T_ab, dtype=np.float64)
     T_ba = np.empty(T_ab.shape)
-    _invert(np.ascontiguousarray(T_ab).reshape(-1, 4, 4), T_ba.reshape(-1, 4, 4))
+    _invert(for_kernel(T_ab).reshape(-1, 4, 4), T_ba.reshape(-1, 4, 4))
     return T_ba
 
 
@@ -55,10 +55,9 @@ def rotate(R_ab: np.ndarray, v_b: np.ndarray) -> np.ndarray:
 
 
 def _transformed(R: np.ndarray, t: np.ndarray, x: np.ndarray) -> np.ndarray:
-    x = np.ascontiguousarray(x, dtype=np.float64)
+    x = for_kernel(x)
     out = np.empty(x.shape)
-    R, t = (np.ascontiguousarray(value, dtype=np.float64) for value in (R, t))
-    _transform(R, t, x.reshape(-1, 3), out.reshape(-1, 3))
+    _transform(for_kernel(R), for_kernel(t), x.reshape(-1, 3), out.reshape(-1, 3))
     return out
 
 
@@ -78,7 +77,7 @@ def exp(xi: np.ndarray) -> np.ndarray:
 
     T. Barfoot, State Estimation for Robotics, 2017, section 7.1.
     """
-    xi = np.ascontiguousarray(xi, dtype=np.float64)
+    xi = for_kernel(xi)
     T = np.empty((*xi.shape[:-1], 4, 4))
     _exp(xi.reshape(-1, 6), T.reshape(-1, 4, 4))
     return T
@@ -95,9 +94,9 @@ def _exp(xi: f8[:, ::1], T: f8[:, :, ::1]):
 
 def log(T: np.ndarray) -> np.ndarray:
     """Map rigid motions (..., 4, 4) to twists (..., 6) with rotation angle in [0, pi]."""
-    T = np.ascontiguousarray(T, dtype=np.float64)
+    T = for_kernel(T)
     xi = np.empty((*T.shape[:-2], 6))
-    quaternion = np.ascontiguousarray(quaternion_xyzw(T)).reshape(-1, 4)
+    quaternion = for_kernel(quaternion_xyzw(T)).reshape(-1, 4)
     _log(T.reshape(-1, 4, 4), quaternion, xi.reshape(-1, 6))
     return xi
 

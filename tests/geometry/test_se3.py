@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from slamcli.errors import SlamError
-from slamcli.geometry import se3
+from slamcli.geometry import algebra, elementary, se3
 
 directions = st.tuples(*[st.floats(-1.0, 1.0)] * 3).filter(lambda d: np.linalg.norm(d) > 0.1)
 angles = st.one_of(st.floats(0.0, 1e-3), st.floats(0.0, 3.1), st.floats(3.1, np.pi - 1e-6))
@@ -86,3 +86,18 @@ def test_umeyama_never_mirrors():
 def test_umeyama_refuses_what_is_undetermined(points):
     with pytest.raises(SlamError, match="alignment"):
         se3.umeyama(points, points)
+
+
+def test_arrays_mapped_from_files_need_no_kernel_of_their_own():
+    """They are read-only, for which numba would compile every kernel again at its first call."""
+    T, xi, x = se3.exp(np.full((3, 6), 0.1)), np.full((3, 6), 0.1), np.ones((5, 3))
+    for array in (T, xi, x):
+        array.flags.writeable = False
+    kernels = (se3._invert, se3._transform, se3._exp, se3._log, algebra._multiply, algebra._nearest_rotations, elementary._sines)
+    for f in (se3.inverse, se3.log, se3.orthonormalize, algebra.eigh, algebra.inverse):
+        f(T)
+    se3.exp(xi)
+    se3.transform(T[0], x)
+    algebra.product(T, T[0])
+    elementary.sin(x)
+    assert [len(kernel.signatures) for kernel in kernels] == [1] * len(kernels)
