@@ -74,7 +74,7 @@ class Simulation:
 def simulate(out: Path, *, progress: Progress, workers: int = 2, **settings: object) -> Path:
     """Write a simulated recording into the new folder `out`; see Simulation for the settings.
 
-    The same settings give the same bytes. The folder appears only when complete.
+    The same settings give the same bytes on the same machine, and all but a few pixels on another. The folder appears only when complete.
     """
     what = Simulation(**settings)  # type: ignore[arg-type]
     _check(what)
