@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from slamcli.datasets.simulated import drive, noise, people, room
+from slamcli.datasets.simulated import building, drive, noise, people, room
 from slamcli.datasets.simulated.drive import Motion
 from slamcli.datasets.simulated.figures import Figure
 from slamcli.datasets.simulated.noise import SensorNoise
@@ -26,8 +26,12 @@ DEPTH_SCALE = 5000.0
 TEXEL_AT_640 = 0.004  # [m] finest texture pixel for images 640 px wide: what such a camera resolves at 2 m
 MAX_TEXELS = 30e6
 PATH_MARGIN = 1.35  # [m] of the robot's round from the walls
+AHEAD = 0.35  # [m] on either side of the robot, over which the direction of its way through a building is taken
 MOST_PEOPLE = 20
 SIDES = (4.0, 50.0)  # [m] of a room: the furniture needs so much, the textures fill the memory
+MOST_RECORDINGS = 100
+OVERLAP = 0.4  # of a recording's part of the way that the next one drives too
+LIGHTS = 1.0, 0.75, 1.2, 0.85, 1.1  # brightness of one recording after the other
 AROUND_TRAJECTORY = 1.6  # [m] from a given trajectory to the walls
 PNG_SETTINGS = [cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_SUB]
 
@@ -56,12 +60,20 @@ class Simulation:
     holes: float = 0.0  # share of all surface that gives no depth, as glass and black or shiny things do
     textured: float = 1.0  # share of objects and walls with a picture on them
     dark: bool = False  # nothing but noise in the colour images; depth brings its own light
-    movable: bool = False  # a parcel that is gone in the second half
+    movable: bool = False  # a parcel that is taken away,
+    gone_from: float = 0.5  # after this share of the frames; 1 = never
     people: int = 0  # who walk about in view of the camera
     activities: tuple[str, ...] = ()  # that they take up in turn; () = all there are
+    start: float = 0.0  # share of the round at which the drive begins
+    backwards: bool = False  # drive the round the other way
+    light: float = 1.0  # brightness; another exposure, too
+    take: int = 0  # number of the recording of one scene: another draw of the noise
+    twin: int = 0  # another place of the same makers: equal patterns and pieces, arranged otherwise; of a corridor other ends
     alias: str = ""  # "posters": opposite walls are the same; "corridor": equal doors
     room: tuple[float, float] = (8.0, 5.0)
     empty: bool = False  # nothing stands in the room
+    building: bool = False  # rooms along a corridor instead of one room
+    rooms: int = 10  # of the building
     trajectory: Path | None = None  # TUM file to follow instead of driving rounds
     stamps: Path | None = None  # "colour depth" stamps for it
 
@@ -95,24 +107,58 @@ def simulate(out: Path, *, progress: Progress, workers: int = 2, **settings: obj
     return out
 
 
+def simulate_several(out: Path, recordings: int, *, progress: Progress, workers: int = 2, **settings: object) -> list[Path]:
+    """Write several recordings of one scene into the new folder `out`, as 1, 2, ... ; their true poses are told in one frame.
+
+    Each begins elsewhere on the way, every second drives it the other way, and each has a light and stamps of its own. Each covers
+    `OVERLAP` of the part of the next, and all together as many rounds as `laps` says. What is there already stays.
+    """
+    if not 1 <= recordings <= MOST_RECORDINGS:
+        raise SlamError(f"recordings = {recordings}: must be from 1 to {MOST_RECORDINGS}")
+    laps = float(settings.get("laps", Simulation.laps))  # type: ignore[arg-type]
+    share = (1.0 + OVERLAP) * laps / recordings
+    made = []
+    for take in range(recordings):
+        backwards = take % 2 == 1
+        start = (take * laps / recordings + (share if backwards else 0.0)) % 1.0
+        own: dict[str, object] = {"laps": share, "start": start, "backwards": backwards, "light": LIGHTS[take % len(LIGHTS)], "take": take}
+        folder = out / str(take + 1)
+        if not folder.is_dir():
+            out.mkdir(parents=True, exist_ok=True)
+            simulate(folder, progress=progress, workers=workers, **{**settings, **own})
+        made.append(folder)
+    return made
+
+
 def build(what: Simulation) -> tuple[Scene, Motion]:
     """Make the motion and a room around it."""
     if what.trajectory is not None:
         return _around_trajectory(what, what.trajectory)
+    if what.building:
+        path = building.way(what.rooms)
+        length = float(np.linalg.norm(np.roll(path, -1, axis=0) - path, axis=1).sum())
+        motion = _drive(what, path, np.random.default_rng([what.seed, 2]), ahead=AHEAD / length)
+        return building.house(what.rooms, path, seed=what.seed), motion
     low, high = np.zeros(3), np.array([*what.room, room.HEIGHT])
     margin = PATH_MARGIN
     if what.alias == "corridor":
         high, margin = np.array([16.0, 2.4, room.HEIGHT]), 0.75
     rng = np.random.default_rng([what.seed, 2])
     path = drive.closed_path(low, high, margin, rng)
-    motion = drive.rounds(path, frames=what.frames, speed=what.speed, turn_rate=what.turn_rate, rate=what.rate, laps=what.laps,
-                          height=what.camera_height, pitch=np.radians(what.pitch), rng=rng, rest=what.rest)  # fmt: skip
+    motion = _drive(what, path, rng)
     if what.alias == "corridor":
-        return room.corridor(low, high, seed=what.seed), motion
+        return room.corridor(low, high, seed=what.seed, twin=what.twin), motion
     centres = np.column_stack([path, np.zeros(len(path))])  # the robot itself is on the floor
     return room.furnished_room(
-        low, high, centres, seed=what.seed, twins=what.alias == "posters", movable=what.movable, empty=what.empty
+        low, high, centres, seed=what.seed, twin=what.twin, twins=what.alias == "posters", movable=what.movable, empty=what.empty
     ), motion
+
+
+def _drive(what: Simulation, path: np.ndarray, rng: np.random.Generator, **more: float) -> Motion:
+    """Drive along a closed path (N, 2) as it is asked for; more : arguments of `drive.rounds`."""
+    path = drive.turned(path, start=what.start, backwards=what.backwards)
+    return drive.rounds(path, frames=what.frames, speed=what.speed, turn_rate=what.turn_rate, rate=what.rate, laps=what.laps,
+                        height=what.camera_height, pitch=np.radians(what.pitch), rng=rng, rest=what.rest, **more)  # fmt: skip
 
 
 def _around_trajectory(what: Simulation, trajectory: Path) -> tuple[Scene, Motion]:
@@ -154,7 +200,8 @@ def _check(what: Simulation) -> None:
     bounds = {
         "frames": (1, 1_000_000), "laps": (0.01, 1000), "speed": (0.001, 100), "turn_rate": (0.001, 100), "rate": (0.1, 1000), "rest": (0, 3600),
         "width": (32, 4096), "height": (32, 4096), "field_of_view": (20, 120), "camera_height": (0.1, 2.4), "pitch": (-80, 80),
-        "depth_min": (0, 10), "depth_max": (0.1, 13), "textured": (0, 1), "holes": (0, 1), "seed": (0, 2**31), "people": (0, MOST_PEOPLE),
+        "start": (0, 1), "light": (0.05, 4), "take": (0, 1_000_000), "twin": (0, 1_000_000),
+        "rooms": (1, building.MOST_ROOMS), "gone_from": (0, 1), "depth_min": (0, 10), "depth_max": (0.1, 13), "textured": (0, 1), "holes": (0, 1), "seed": (0, 2**31), "people": (0, MOST_PEOPLE),
     }  # fmt: skip
     for name, (least, most) in bounds.items():
         value = getattr(what, name)
@@ -164,6 +211,8 @@ def _check(what: Simulation) -> None:
         raise SlamError(f"noise = {what.noise!r}, alias = {what.alias!r}: known are noise kinect, none and alias posters, corridor")
     if unknown := sorted(set(what.activities) - set(people.ACTIVITIES)):
         raise SlamError(f"activities: {unknown[0]!r} is unknown; known are {', '.join(people.ACTIVITIES)}")
+    if what.building and (what.people or what.movable or what.alias or what.trajectory is not None):
+        raise SlamError("building: takes no people, moved object, alias or trajectory")
     if what.depth_min >= what.depth_max:
         raise SlamError(f"depth_min = {what.depth_min}, depth_max = {what.depth_max}: the first must be smaller")
     if min(what.room) < SIDES[0] or max(what.room) > SIDES[1]:
@@ -178,14 +227,15 @@ def _write_lists(folder: Path, what: Simulation, scene: Scene, motion: Motion, f
     poses = np.concatenate([motion.colour_T_lc, motion.depth_T_lc])[first]
     write_tum(folder / "groundtruth.txt", Trajectory(stamp=stamp, T_wc=poses))
     (folder / "camera.json").write_text(json.dumps(what.camera().to_dict(), indent=1) + "\n")
-    gone_from = float(motion.colour_stamp[len(motion.colour_stamp) // 2]) if what.movable else None
+    n_with = int(what.gone_from * len(motion.colour_stamp))
+    gone_from = float(motion.colour_stamp[n_with]) if n_with < len(motion.colour_stamp) else None
     about = {
         "format": FORMAT,
         "frame": "level: z up, floor z = 0, metres, radians; groundtruth.txt maps the colour camera to it",
         "seed": what.seed,
         "noise": what.noise,
         **scene.to_dict(),
-        "gone": [{"name": solid.name, "from": gone_from} for solid in scene.solids if solid.is_movable],
+        "gone": [{"name": solid.name, "from": gone_from} for solid in scene.solids if solid.is_movable and gone_from is not None],
     }
     if figures:
         about["moving"] = [
@@ -213,8 +263,8 @@ def _write_images(
     normal_noise, camera = noise.NormalNoise((what.height, what.width), what.seed), what.camera()
 
     def one(i: int) -> None:
-        rng = np.random.default_rng([what.seed, 3, i])
-        shown = i < n // 2
+        rng = np.random.default_rng([what.seed, 3, i, *([what.take] if what.take else [])])
+        shown = i < int(what.gone_from * n)
         rgb, depth, cosine = renderer.render(motion.colour_T_lc[i], with_movable=shown)
         if crowd is not None:
             drawn = crowd.draw(motion.colour_T_lc[i], motion.colour_stamp[i], rgb, depth, cosine)
@@ -228,6 +278,8 @@ def _write_images(
                 depth, cosine = drawn.depth, drawn.cosine
         if what.dark:
             rgb = np.zeros_like(rgb)
+        if what.light != 1.0:
+            rgb = rgb * np.float32(what.light)
         lost = noise.without_reading(depth, motion.depth_T_lc[i], camera, share=what.holes, seed=what.seed) if what.holes else None
         if what.noise == "kinect":
             depth = noise.depth_noise(depth, cosine, camera.fx, sensor, normal_noise, rng)

@@ -147,6 +147,9 @@ def test_following_a_trajectory_keeps_its_motion_and_both_clocks(tmp_path: Path)
         ({"trajectory": Path("none.txt")}, "none.txt: cannot be read"),
         ({"depth_min": 4.0, "depth_max": 3.0}, "depth_min"),
         ({"speed": float("nan")}, "speed"),
+        ({"start": 1.5}, "start"),
+        ({"light": 0.0}, "light"),
+        ({"building": True, "people": 2}, "building: takes no people"),
     ],
 )
 def test_settings_that_cannot_be_are_told(tmp_path: Path, settings: dict, said: str) -> None:
@@ -192,7 +195,12 @@ def test_defaults_of_the_command_line_are_the_simulation_s() -> None:
     defaults = {parameter.name: parameter.default for parameter in command.params}
     for name in (
         "seed",
-        "laps",
+        "start",
+        "light",
+        "take",
+        "twin",
+        "gone_from",
+        "rooms",
         "rate",
         "width",
         "height",

@@ -32,31 +32,38 @@ def closed_path(low: np.ndarray, high: np.ndarray, margin: float, rng: np.random
         [np.sign(np.cos(angle)) * np.abs(np.cos(angle)) ** power, np.sign(np.sin(angle)) * np.abs(np.sin(angle)) ** power], axis=1
     )
     path = (low[:2] + high[:2]) / 2 + half * round_ * (1.0 + wave)[:, None]
-    return _smooth_closed(_even(path), 0.04)
+    return smoothed(evened(path), 0.04)
+
+
+def turned(path: np.ndarray, *, start: float, backwards: bool) -> np.ndarray:
+    """Return a closed path (N, 2) that begins at a share of its length and may lead the other way."""
+    path = np.roll(path, -round(start * len(path)), axis=0)
+    return np.roll(path[::-1], 1, axis=0) if backwards else path
 
 
 def rounds(
     path: np.ndarray, *, frames: int | None, speed: float, turn_rate: float, rate: float, laps: float, height: float, pitch: float,
-    rng: np.random.Generator, rest: float = 0.0,
+    rng: np.random.Generator, rest: float = 0.0, ahead: float = 0.005,
 ) -> Motion:  # fmt: skip
     """Drive along a closed path.
 
     frames : number of images; None = as many as `speed` [m/s] and `turn_rate` [rad/s], at most, take at `rate` [Hz]
     laps : rounds, any fraction
     rest : [s] of standing still half-way
+    ahead : share of the path on either side over which its direction is taken
     height, pitch : of the camera [m], [rad], positive up; the robot rocks by some millimetres and tenths of a degree
     """
     step = np.roll(path, -1, axis=0) - path
     length = np.linalg.norm(step, axis=1)
     heading = np.unwrap(np.arctan2(step[:, 1], step[:, 0]))
     turn = np.abs(np.diff(heading, append=heading[0] + 2 * np.pi * np.round((heading[-1] - heading[0]) / (2 * np.pi))))
-    seconds = _smooth_closed(np.hypot(length / speed, turn / turn_rate)[:, None], 0.02)[:, 0]
+    seconds = smoothed(np.hypot(length / speed, turn / turn_rate)[:, None], 0.02)[:, 0]
     clock = np.concatenate([[0.0], np.cumsum(seconds)])  # at each point of the path, over one lap
     total = laps * clock[-1]
     n = frames if frames is not None else max(2, round(total * rate) + 1) + round(rest * rate)
     when = _clock(total, n, rate, rest)
     share = np.interp(when % clock[-1], clock, np.arange(DENSE + 1) / DENSE) + when // clock[-1]
-    xy, psi = _at(path, share), _heading_at(path, share)
+    xy, psi = _at(path, share), _heading_at(path, share, ahead)
     wobble = [_sway(share, rng) for _ in range(5)]
     side = np.stack([-np.sin(psi), np.cos(psi)], axis=1)
     position = np.column_stack([xy + 0.03 * wobble[0][:, None] * side, height + 0.003 * wobble[1]])
@@ -123,15 +130,15 @@ def interpolate(trajectory: Trajectory, stamp: np.ndarray) -> np.ndarray:
     return se3.interpolate(trajectory.T_wc[before], trajectory.T_wc[after], alpha)
 
 
-def _even(path: np.ndarray) -> np.ndarray:
-    """Resample a closed path at even arc length."""
+def evened(path: np.ndarray) -> np.ndarray:
+    """Resample a closed path (N, 2) at even arc length, (DENSE, 2)."""
     closed = np.concatenate([path, path[:1]])
     arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1))])
-    at = np.linspace(0.0, arc[-1], len(path), endpoint=False)
+    at = np.linspace(0.0, arc[-1], DENSE, endpoint=False)
     return np.stack([np.interp(at, arc, closed[:, k]) for k in range(2)], axis=1)
 
 
-def _smooth_closed(values: np.ndarray, share: float) -> np.ndarray:
+def smoothed(values: np.ndarray, share: float) -> np.ndarray:
     """Smooth a periodic signal (N, k) with a Gaussian whose sigma is a share of the period."""
     n = len(values)
     frequency = np.fft.rfftfreq(n, d=1.0 / n)
@@ -145,6 +152,6 @@ def _at(path: np.ndarray, share: np.ndarray) -> np.ndarray:
     return np.stack([np.interp(share % 1.0, grid, np.append(path[:, k], path[0, k])) for k in range(2)], axis=1)
 
 
-def _heading_at(path: np.ndarray, share: np.ndarray, ahead: float = 0.005) -> np.ndarray:
+def _heading_at(path: np.ndarray, share: np.ndarray, ahead: float) -> np.ndarray:
     step = _at(path, share + ahead) - _at(path, share - ahead)
     return np.arctan2(step[:, 1], step[:, 0])

@@ -30,17 +30,26 @@ WALL_FRAMES = {
 
 
 def furnished_room(
-    low: np.ndarray, high: np.ndarray, path: np.ndarray, *, seed: int, twins: bool = False, movable: bool = False, empty: bool = False
+    low: np.ndarray,
+    high: np.ndarray,
+    path: np.ndarray,
+    *,
+    seed: int,
+    twin: int = 0,
+    twins: bool = False,
+    movable: bool = False,
+    empty: bool = False,
 ) -> Scene:
     """Furnish a room so that the camera's path never comes near an object.
 
     low, high : (3,) [m] corners of the room
     path : (N, 3) [m] camera centres
+    twin : another number is another room with the same patterns and the same kinds of pieces
     twins : opposite walls look the same
     movable : put a large parcel beside the path, marked as movable
     empty : put nothing into it
     """
-    rng = np.random.default_rng([seed, 0])
+    rng = np.random.default_rng([seed, 0, *([twin] if twin else [])])
     free = FreeSpace(low, high, path)
     walls, doors = _paint_walls(low, high, rng, twins)
     for rect in doors:
@@ -49,7 +58,7 @@ def furnished_room(
     if not empty:
         _special_boxes(solids, free, rng, high[2], movable)
         _island(solids, free, rng)
-        _along_walls(solids, free, rng)
+        along_walls(solids, free, rng)
         _scatter(solids, free, rng)
     lamps = _lamps(low, high)
     base = pick(rng, (t.planks((196, 150, 100)), t.planks((150, 106, 72)), t.tiles((206, 198, 184)), t.planks((214, 186, 146))))
@@ -59,8 +68,11 @@ def furnished_room(
     return Scene(low, high, solids, shell, lamps, seed)
 
 
-def corridor(low: np.ndarray, high: np.ndarray, *, seed: int) -> Scene:
-    """Make a corridor in which every door, floor tile and lamp looks like the next; only the ends differ."""
+def corridor(low: np.ndarray, high: np.ndarray, *, seed: int, twin: int = 0) -> Scene:
+    """Make a corridor in which every door, floor tile and lamp looks like the next; only the ends differ.
+
+    twin : another number is another corridor that differs at its ends alone
+    """
     rng = np.random.default_rng([seed, 0])
     items = (
         (0.35, 0.5, 0.9, high[2] - 0.5, p.door((150, 110, 80), "OFFICE")),
@@ -69,7 +81,8 @@ def corridor(low: np.ndarray, high: np.ndarray, *, seed: int) -> Scene:
     )
     side = t.repeated(p.wall(t.plaster(pick(rng, WALL_COLOURS)), items), CORRIDOR_PITCH)
     width = float(high[1] - low[1])
-    east, west = (_wall_items(width, high[2], rng, []) for _ in range(2))
+    rng = np.random.default_rng([seed, 0, twin]) if twin else rng
+    east, west = (wall_items(width, high[2], rng, []) for _ in range(2))
     walls = {"south": side, "north": side, "east": p.wall(t.brick((180, 96, 76)), east), "west": p.wall(t.plaster((150, 180, 200)), west)}
     floor = t.repeated(t.tiles((206, 198, 184), 0.25), CORRIDOR_PITCH)
     ceiling = t.repeated(p.ceiling(((CORRIDOR_PITCH / 2, width / 2),)), CORRIDOR_PITCH)
@@ -144,14 +157,14 @@ def _paint_walls(
             a = low[:2] + start * (high - low)[:2] + right * door_at
             b = a + right * 0.95 + np.array([-right[1], right[0]]) * -0.5
             doors.append((np.minimum(a, b), np.maximum(a, b)))
-        items += _wall_items(length, high[2], rng, [(door_at, door_at + 0.95)] if has_door else [])
+        items += wall_items(length, high[2], rng, [(door_at, door_at + 0.95)] if has_door else [])
         walls[name] = p.wall(bases[order[number]], tuple(items))
     if twins:
         walls["north"], walls["west"] = walls["south"], walls["east"]
     return walls, doors
 
 
-def _wall_items(length: float, height: float, rng: np.random.Generator, taken: list[tuple[float, float]]) -> tuple:
+def wall_items(length: float, height: float, rng: np.random.Generator, taken: list[tuple[float, float]]) -> tuple:
     """Hang pictures in columns of one to three, and now and then a window."""
     items = []
     x = rng.uniform(0.1, 0.3)
@@ -183,7 +196,7 @@ def _rect(x: float, y: float, yaw: float, piece: Piece) -> tuple[np.ndarray, np.
     return corners.min(axis=0), corners.max(axis=0)
 
 
-def _along_walls(solids: list[Solid], free: FreeSpace, rng: np.random.Generator) -> None:
+def along_walls(solids: list[Solid], free: FreeSpace, rng: np.random.Generator) -> None:
     """Line the walls with furniture, as varied as possible."""
     makers = list(furniture.ALONG_WALLS)
     count = 0

@@ -3,7 +3,7 @@
 Level frame: x and y span the floor, z points up, the floor is z = 0.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -44,6 +44,7 @@ class Solid:
     yaw: float  # [rad] about z
     painters: dict[str, Painter]  # by side, "" = all others
     is_movable: bool = False
+    shared: dict[str, str] = field(default_factory=dict)  # by side, whose picture it shows: of one name, all look alike
 
     def to_dict(self) -> dict[str, Any]:
         """Return the entry of scene.json."""
@@ -72,7 +73,7 @@ class Solid:
                 continue
             down = -np.cross(normal, right)
             origin = self.centre + R @ (0.5 * self.size * (normal - right - down))
-            patches.append(rectangle(origin, R @ (self.size * right), R @ (self.size * down), self._painter(side), (self.name, side),
+            patches.append(rectangle(origin, R @ (self.size * right), R @ (self.size * down), self._painter(side), (self.shared.get(side, self.name), side),
                                      is_movable=self.is_movable))  # fmt: skip
         return patches
 
