@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal
 
 from slamcli.config import toml
@@ -20,8 +21,8 @@ from slamcli.config.options import Config
 from slamcli.config.toml import Settings
 from slamcli.console import Progress, Tell, log_file, silent
 from slamcli.errors import SlamError
-from slamcli.runs.pipeline import Pipeline
 from slamcli.runs.run_directory import RunDir, default_path
+from slamcli.runs.several import entries, extend, joined, pipeline
 from slamcli.runs.staleness import State
 from slamcli.stages import NAMES
 
@@ -42,7 +43,7 @@ log = logging.getLogger(__name__)
 
 
 def run(
-    target: str | os.PathLike[str],
+    target: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
     *,
     settings: Settings = (),
     config: str | None = None,
@@ -57,7 +58,7 @@ def run(
 ) -> "Run":
     """Make a run of a recording, or bring the one that is there up to date: exactly the stages that need it.
 
-    target : a recording's folder, a name such as ``tum/fr1_room``, or ``demo``
+    target : a recording's folder, a name such as ``tum/fr1_room``, or ``demo``; of several, which then have one map, `path` must be given
     settings : options by full name, ``{"track.min_inliers": 20}``, laid over the run's own (the defaults for a new run)
     config : fast, accurate, default or a TOML file, to start from instead of the run's own
     path : the run directory; None: ``runs/<recording>``
@@ -70,10 +71,11 @@ def run(
     """
     settings = settings if isinstance(settings, Mapping) else tuple(settings)
     resolve = partial(toml.resolve, name_or_file=config, settings=settings)
-    opened, dataset, resolved = create_run(str(target), resolve=resolve, path=path, data=data, progress=progress)
-    found: Sequence[Finding] = ()
-    if look is not None and (force or start == NAMES[0] or not Pipeline(opened, resolved, dataset=dataset).states()[NAMES[0]].is_fresh):
-        found = look(dataset)
+    targets = [str(target)] if isinstance(target, (str, os.PathLike)) else [str(one) for one in target]
+    opened, dataset, resolved = create_run(targets, resolve=resolve, path=path, data=data, progress=progress)
+    found: dict[str, Sequence[Finding]] = {}
+    if look is not None and (force or start == NAMES[0] or not pipeline(opened, resolved, dataset=dataset).states()[NAMES[0]].is_fresh):
+        found = {str(one.root.resolve()): look(one) for one in getattr(dataset, "parts", [dataset])}
     which: dict[str, Any] = {"start": start, "until": until, "force": force}
     _bring_up_to_date(opened, resolved, dataset, looked=found, progress=progress, tell=tell, **which)
     return Run(opened)
@@ -135,13 +137,37 @@ class Run:
         _bring_up_to_date(self.directory, resolved, None, start=start, until=until, force=force, progress=progress, tell=tell)
         return self
 
+    def add(
+        self,
+        *targets: str | os.PathLike[str],
+        data: str | None = None,
+        progress: Progress = silent,
+        tell: Tell = log.info,
+        look: "Callable[[Dataset], Sequence[Finding]] | None" = None,
+    ) -> "Run":
+        """Add recordings to the map, and bring the run up to date; none that is in it already is tracked again.
+
+        The arguments are those of `slamcli.run`. Done again, as after an interruption, it goes on.
+        """
+        self.directory.restore()
+        config = self.config()
+        datasets = [_opened(str(target), config, data, progress) for target in targets]
+        looked = {str(dataset.root.resolve()): look(dataset) for dataset in datasets} if look is not None else {}
+        with writing(self.directory, config):
+            self.directory.mark_latest()
+            extend(self.directory, datasets)
+            stages = pipeline(self.directory, config, progress=progress, tell=tell)
+            stages.keep_looks(looked)
+            stages.bring_up_to_date()
+        return self
+
     def run_stage(
         self, stage: str, *, settings: Settings = (), config: str | None = None, progress: Progress = silent, tell: Tell = log.info
     ) -> "Run":
         """Run one stage alone, even when it is up to date, from whatever its predecessors left."""
         resolved = toml.resolve(self.config(), config, settings)
         with writing(self.directory, resolved):
-            Pipeline(self.directory, resolved, progress=progress, tell=tell).run_alone(stage)
+            pipeline(self.directory, resolved, progress=progress, tell=tell).run_alone(stage)
         return self
 
     # what holds
@@ -152,7 +178,7 @@ class Run:
         settings, config : judge as if these had been given; nothing is changed
         verify : read every file again and compare its digest
         """
-        return Pipeline(self.directory, toml.resolve(self.config(), config, settings)).states(verify=verify)
+        return pipeline(self.directory, toml.resolve(self.config(), config, settings)).states(verify=verify)
 
     def record(self, stage: str) -> dict[str, Any] | None:
         """Read what a stage said of itself: configuration, inputs, outputs, cost, warnings; None before it was run."""
@@ -251,33 +277,60 @@ class Run:
 
 
 def create_run(
-    target: str,
+    targets: Sequence[str],
     *,
     resolve: Callable[[Config | None], Config],
     path: str | os.PathLike[str] | None = None,
     data: str | None = None,
     progress: Progress = silent,
 ) -> "tuple[RunDir, Dataset, Config]":
-    """Open the recording and make its run, or open the run that is there; no stage is run and no configuration written.
+    """Open the recording, or several that are to have one map, and make their run, or open the run that is there.
 
     resolve : gives the configuration under which to run, from the run's own; None where there is no run yet
-    """
-    from slamcli.datasets import open_dataset
 
-    def opened(config: Config) -> "Dataset":
-        return open_dataset(target, data=data, camera=dict(config.camera) or None, options=config.recording, progress=progress)
+    No stage is run and no configuration written. Raises SlamError where several are given, but no `path`.
+    """
+    if not targets:
+        raise SlamError("no recording named; give a folder, tum/fr1_room or demo")
+    if len(targets) > 1 and path is None:
+        raise SlamError(
+            "several recordings make one map, whose run needs a name, such as -r runs/house; for a run of each: slamcli batch RECORDING..."
+        )
+
+    def opened(config: Config) -> "list[Dataset]":
+        return [_opened(target, config, data, progress) for target in targets]
 
     if path is not None:
         RunDir(Path(path)).restore()
     first = resolve(RunDir(Path(path)).config() if path is not None else None)
-    dataset = opened(first)
-    place = Path(path) if path is not None else default_path(dataset.name)
+    datasets = opened(first)
+    place = Path(path) if path is not None else default_path(datasets[0].name)
     RunDir(place).restore()
     config = resolve(RunDir(place).config())
     if (config.camera, config.recording) != (first.camera, first.recording):  # an earlier command gave this run others
-        dataset = opened(config)
+        datasets = opened(config)
+    if len(datasets) > 1:
+        return *_create_of_several(place, datasets), config
+    (dataset,) = datasets
     directory = RunDir.create(place, dataset=dataset.name, root=str(dataset.root.resolve()), digest=dataset.digest())
     return directory, dataset, config
+
+
+def _opened(target: str, config: Config, data: str | None, progress: Progress) -> "Dataset":
+    from slamcli.datasets import open_dataset
+
+    return open_dataset(target, data=data, camera=dict(config.camera) or None, options=config.recording, progress=progress)
+
+
+def _create_of_several(place: Path, datasets: "Sequence[Dataset]") -> "tuple[RunDir, Dataset]":
+    """Make the run of several recordings; in a run of the same that is there they keep their order and their names."""
+    found = entries(datasets)
+    roots = {entry["root"]: entry for entry in found}
+    there = RunDir(place).recordings if (place / "run.json").is_file() else []
+    if {entry["root"] for entry in there} == roots.keys():
+        found = [{**entry, "digest": roots[entry["root"]]["digest"]} for entry in there]
+    dataset = joined(found, datasets)
+    return RunDir.create(place, dataset=dataset.name, root=str(dataset.root), digest=dataset.digest(), recordings=found), dataset
 
 
 def _bring_up_to_date(
@@ -287,14 +340,14 @@ def _bring_up_to_date(
     *,
     progress: Progress,
     tell: Tell,
-    looked: "Sequence[Finding]" = (),
+    looked: "Mapping[str, Sequence[Finding]]" = MappingProxyType({}),
     **which: Any,
 ) -> None:
     with writing(directory, config):
         directory.mark_latest()
-        pipeline = Pipeline(directory, config, dataset=dataset, progress=progress, tell=tell)
-        pipeline.looked = looked
-        pipeline.bring_up_to_date(**which)
+        stages = pipeline(directory, config, dataset=dataset, progress=progress, tell=tell)
+        stages.keep_looks(looked)
+        stages.bring_up_to_date(**which)
 
 
 @contextmanager

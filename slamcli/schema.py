@@ -1,7 +1,7 @@
 """The core types. Each is a frozen record of arrays and, saved as a folder of `.npy`, also an artefact's schema.
 
 F frames, M features, P pairs, Q matches, W words, K key frames, L landmarks, O observations, E edges, C closures, R rests.
-v x u blocks of a view, H x W cells of the grid, N poses of a trajectory.
+v x u blocks of a view, H x W cells of the grid, N poses of a trajectory, D recordings.
 Missing values: depth and pose NaN, index -1. `offset` columns delimit ragged rows: those of frame i are offset[i]:offset[i+1].
 """
 
@@ -148,11 +148,41 @@ class Timing:
     readout: np.ndarray = array(
         "f8", "", "s, between the first and the last row of a colour image; 0 = global shutter; the stamp is the middle row's"
     )
-    depth_readout: np.ndarray = array("f8", "", "s, the same of a depth image")
+    depth_readout: np.ndarray = array(
+        "f8", "", "s, the same of a depth image; NaN = each recording of several has its own timing, which Measured is free of"
+    )
     depth_delay: np.ndarray = array(
         "f8", "", "s, by which depth images were taken later than their stamps say; NaN = depth is not moved to the colour stamp"
     )
     twist: np.ndarray = array("f8", "F 6", "m/s, rad/s, motion of each frame's camera in its own frame")
+
+    @property
+    def is_of_several(self) -> bool:
+        """Say whether several recordings were measured, each with a timing of its own."""
+        return bool(np.isnan(self.depth_readout))
+
+
+@dataclass(frozen=True)
+class Recordings:
+    """Which frames are of which recording, by extract of a run of several, whose frames are numbered through."""
+
+    recording_offset: np.ndarray = array("i8", "D+1", "frames of a recording")
+    own_stamp: np.ndarray = array("f8", "F", "s, of the colour image in its recording; stamps of Features are of one time line for all")
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What the features of several recordings measured, without rolling shutter and at the colour stamp, by optimize of a run of several."""
+
+    measured_xy: np.ndarray = array("f4", "M 2", "px, undistorted, column then row")
+    measured_depth: np.ndarray = array("f4", "M", "m along the optical axis, NaN where there is none")
+
+
+@dataclass(frozen=True)
+class DepthTimes:
+    """When depth was measured, by optimize and loop of a run of several recordings, as each has a delay of its own."""
+
+    depth_time: np.ndarray = array("f8", "F", "s, on the time line of Features; NaN = there is no depth, or it is not moved")
 
 
 @dataclass(frozen=True)

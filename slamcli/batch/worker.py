@@ -151,7 +151,7 @@ class Desk:
         """Bring the run up to date as far as `stage`, in general that stage alone."""
         target, order = self.open(stage), self.job.order
         logging.getLogger("slamcli").setLevel(logging.DEBUG)  # a run's log.txt has everything, here as from the command line
-        directory, dataset, config = api.create_run(target, resolve=self._resolve, path=self.directory.path, data=order.data)
+        directory, dataset, config = api.create_run([target], resolve=self._resolve, path=self.directory.path, data=order.data)
         # Another process may still be at it for a client that has died since: what it makes is then found up to date.
         with api.writing(directory, config, wait=True):
             before = _written(directory, stage)

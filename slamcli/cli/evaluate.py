@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
@@ -15,6 +16,8 @@ if TYPE_CHECKING:
 
     from slamcli.runs.run_directory import RunDir
     from slamcli.schema import Trajectory
+
+Given = TypeVar("Given")
 
 APE_COLUMNS = {
     "name": ("trajectory", ""),
@@ -93,8 +96,10 @@ def ape_command(
       slamcli eval ape runs/a runs/b --style latex   several in one table
       slamcli eval ape --other ORB-SLAM3=f.txt --plot ape.png
       slamcli eval ape --truth mocap.txt --truth-offset -1.2
+
+    Of a run of several recordings, first all together, then each under the same alignment; their truths must be told in one frame.
     """
-    from slamcli.evaluation import plots, tables, trajectory_error
+    from slamcli.evaluation import of_several, plots, tables, trajectory_error
 
     results, rows = [], []
     for folder in _open_runs(runs, run):
@@ -102,11 +107,14 @@ def ape_command(
         for name, which, estimate in _trajectories(folder, stage, other):
             results.append(trajectory_error.ape(estimate, true, n_frames=n_frames, name=name, stage=which))
             rows.append(results[-1].to_dict() | trajectory_error.sure_figures(folder, results[-1]))
+            if which and folder.recordings:
+                rows[-1]["recordings"] = [_without_sure(one.to_dict()) for one in of_several.apes(folder, results[-1], true)]
             if which:
                 _record(folder, "ape.json", rows[-1])
     if plot is not None:
         plots.plot_ape(results, plot)
-    click.echo(_json(rows, several=_are_several(runs, stage, other)) if as_json else tables.render(rows, APE_COLUMNS, style))
+    flat = [one for row in rows for one in (row, *row.get("recordings", []))]
+    click.echo(_json(rows, several=_are_several(runs, stage, other)) if as_json else tables.render(flat, APE_COLUMNS, style))
 
 
 @eval_group.command("rpe")
@@ -190,6 +198,11 @@ def _label(folder: RunDir) -> str:
     return path.relative_to(RUNS.resolve()).as_posix() if path.is_relative_to(RUNS.resolve()) else path.name
 
 
+def _without_sure(figures: dict[str, Any]) -> dict[str, Any]:
+    """Leave open what is counted for the whole run alone."""
+    return figures | {"doubtful": None, "rmse_sure": None}
+
+
 def _frame_stamp(folder: RunDir) -> np.ndarray:
     from slamcli.schema import Features
 
@@ -204,7 +217,7 @@ def _trajectories(folder: RunDir, stage: str | None, other: tuple[str, ...]) -> 
     last = trajectory_error.last_stage(folder)
     stages = trajectory_error.STAGES[: trajectory_error.STAGES.index(last) + 1] if stage == "all" else (stage or last,)
     found = [(_label(folder), which, trajectory_error.stage_trajectory(folder, which)) for which in stages]
-    for item in other:
+    for item in _of_one_recording(folder, other, "--other"):
         name, equals, file = item.partition("=")
         if not (name and equals and file):
             raise click.BadParameter(f"{item!r}: expected NAME=FILE, such as ORB-SLAM3=CameraTrajectory.txt", param_hint="--other")
@@ -226,6 +239,16 @@ def _record(folder: RunDir, file: str, figures: dict) -> None:
         click.echo(f"Warning: {error}", err=True)
 
 
+def _of_one_recording(folder: RunDir, given: Sequence[Given], flag: str) -> Sequence[Given]:
+    """Refuse a trajectory from outside for a run of several recordings, whose stamps may overlap."""
+    from slamcli.errors import SlamError
+
+    if given and folder.recordings:
+        inside = f"{folder.path}/recordings/{folder.recordings[0]['name']}"
+        raise SlamError(f"{flag}: a run of several recordings has several clocks; evaluate each alone, such as: slamcli eval ape {inside}")
+    return given
+
+
 def _truth(folder: RunDir, file: Path | None, offset: float) -> Trajectory:
     """Read the true trajectory, from `file` or of the recording, its stamps moved by `offset` [s]."""
     from dataclasses import replace
@@ -233,7 +256,8 @@ def _truth(folder: RunDir, file: Path | None, offset: float) -> Trajectory:
     from slamcli.evaluation import trajectory_error
     from slamcli.formats.trajectory import read_tum
 
-    truth = read_tum(file) if file is not None else trajectory_error.ground_truth(folder)
+    given = _of_one_recording(folder, [file] if file is not None else [], "--truth")
+    truth = read_tum(given[0]) if given else trajectory_error.ground_truth(folder)
     return replace(truth, stamp=truth.stamp + offset)
 
 

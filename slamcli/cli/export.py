@@ -33,6 +33,7 @@ LAYOUT_OF = {ending: layout for layout, endings in TRAJECTORY_FORMATS.items() fo
 @click.option(
     "--format", "layout", type=click.Choice(list(TRAJECTORY_FORMATS)), help="[default: by OUT's ending]; kitti has no time stamps."
 )
+@click.option("--recording", metavar="NAME", help="Of a run of several recordings, the poses of this one, at its own stamps.")
 @click.option("--sure-only", is_flag=True, help="Leave out the poses that the run itself doubts; only for the final trajectory.")
 @mount_option
 @json_option
@@ -45,6 +46,7 @@ def export_trajectory(
     mount: tuple[float, ...] | None,
     as_json: bool,
     sure_only: bool,
+    recording: str | None,
 ) -> None:
     """Write the camera's trajectory to OUT: pose of the colour camera, camera to world.
 
@@ -54,8 +56,9 @@ def export_trajectory(
     \b
       slamcli export-trajectory path.txt --frame level
       slamcli export-trajectory base.txt --frame level --mount 0.1,0,0.3,0,0.2,0
+      slamcli export-trajectory monday.txt --recording monday -r runs/house
     """
-    from slamcli.evaluation import trajectory_error
+    from slamcli.evaluation import of_several, trajectory_error
     from slamcli.formats import trajectory as trajectory_file
     from slamcli.navigation.robot_pose import base_in_camera
     from slamcli.runs.run_directory import RunDir
@@ -71,6 +74,8 @@ def export_trajectory(
     trajectory = trajectory_error.stage_trajectory(folder, stage or trajectory_error.last_stage(folder))
     if sure_only:
         trajectory = trajectory_error.sure_part(folder, trajectory)
+    if recording is not None:
+        trajectory = of_several.part(folder, recording, trajectory)
     T_wc = trajectory.T_wc
     if frame == "level":
         ground = folder.load(Ground, "densify")

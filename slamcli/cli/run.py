@@ -10,6 +10,7 @@ from slamcli.cli.common import complete_target, config_option, json_option, reco
 from slamcli.stages import NAMES, STAGES, Stage
 
 if TYPE_CHECKING:
+    from slamcli.api import Run
     from slamcli.datasets import Dataset
     from slamcli.evaluation.map_verdict import Verdict
     from slamcli.runs.placement import Placement
@@ -21,8 +22,8 @@ STAGE = click.Choice(NAMES)
 
 
 @click.command("run")
-@click.argument("target", required=False, shell_complete=complete_target)
-@click.option("-r", "--run", metavar="DIR", help="Where the run goes. [default: $SLAMCLI_RUN, else runs/<recording>]")
+@click.argument("targets", nargs=-1, metavar="[TARGET]...", shell_complete=complete_target)
+@click.option("-r", "--run", metavar="DIR", help="Where the run goes; needed with several. [default: $SLAMCLI_RUN, else runs/<recording>]")
 @click.option("--data", metavar="DIR", help="Folder of recordings. [default: $SLAMCLI_DATA, else ./data]")
 @recording_options
 @config_option
@@ -32,7 +33,7 @@ STAGE = click.Choice(NAMES)
 @click.option("--force", is_flag=True, help="Run every stage even if it is up to date.")
 @json_option
 def run_command(
-    target: str | None,
+    targets: tuple[str, ...],
     run: str | None,
     data: str | None,
     config_name: str | None,
@@ -49,11 +50,15 @@ def run_command(
     `tum/fr1_room`, which is downloaded when it is not found. Without TARGET an existing run goes on. Prints the run directory; with
     --json also what was made and how good the map is.
 
+    Several recordings of one place, by any cameras, make one map: each is tracked alone, and places that two of them saw join them. What
+    joins nothing is kept apart. For a run of each instead: slamcli batch.
+
     \b
       slamcli run demo
       slamcli run tum/fr1_room -s extract.features=1500
       slamcli run path/to/recording -r runs/mine --config accurate
       slamcli run walk.mcap --start 10 --end 60
+      slamcli run monday tuesday upstairs -r runs/house
     """
     from slamcli import api, console
 
@@ -61,14 +66,38 @@ def run_command(
     assignments = (*(f"{name}={json.dumps(value)}" for name, value in selection.items()), *assignments)
     options: dict[str, Any] = {"settings": assignments, "config": config_name, "start": start, "until": until, "force": force}
     options |= {"progress": console.progress, "tell": console.say}
-    if target is None:
-        done = api.open_run(named, restore=True).update(**options)
+    if targets:
+        done = api.run(targets, path=named, data=data, look=_look, **options)
     else:
-        done = api.run(target, path=named, data=data, look=_look, **options)
+        done = api.open_run(named, restore=True).update(**options)
+    _tell_done(done, as_json=as_json, is_whole=until is None)
+
+
+@click.command("add")
+@click.argument("run", metavar="RUN")
+@click.argument("targets", nargs=-1, required=True, metavar="RECORDING...", shell_complete=complete_target)
+@click.option("--data", metavar="DIR", help="Where recordings lie. [default: $SLAMCLI_DATA, else ./data]")
+@json_option
+def add_command(run: str, targets: tuple[str, ...], data: str | None, as_json: bool) -> None:
+    """Add recordings to the map of RUN: they are tracked, joined to it where both saw a place, and all maps are made anew.
+
+    What RUN has tracked already stays as it is. The added ones count as taken later: what they show to be gone fades from the maps.
+
+    \b
+      slamcli add runs/house wednesday
+    """
+    from slamcli import api, console
+
+    done = api.open_run(run, restore=True).add(*targets, data=data, progress=console.progress, tell=console.say, look=_look)
+    _tell_done(done, as_json=as_json, is_whole=True)
+
+
+def _tell_done(done: "Run", *, as_json: bool, is_whole: bool) -> None:
+    """Tell what a run holds now, and refuse to call it a success where no frame has a pose."""
     if as_json:
         click.echo(json.dumps(_made_object(done.directory), indent=1))
     else:
-        if until is None:
+        if is_whole:
             _tell_made(done.directory)
         click.echo(done.path)
     _refuse_no_pose(done.directory)
@@ -173,17 +202,17 @@ def status_command(run: str | None, config_name: str | None, assignments: tuple[
     With -s or --config it shows what such a change would make stale, and changes nothing.
     """
     from slamcli.config import toml
-    from slamcli.runs.pipeline import Pipeline
     from slamcli.runs.run_directory import RunDir
+    from slamcli.runs.several import pipeline
 
     rundir = RunDir.find(run)
-    pipeline = Pipeline(rundir, toml.resolve(rundir.config(), config_name, assignments))
-    states = pipeline.states(verify=verify)
+    judged = pipeline(rundir, toml.resolve(rundir.config(), config_name, assignments))
+    states = judged.states(verify=verify)
     if as_json:
         click.echo(json.dumps([_state_object(state) for state in states.values()], indent=1))
     else:
         click.echo(_state_table(rundir, states))
-    for note in pipeline.notes(states):
+    for note in judged.notes(states):
         click.echo(f"note: {note}", err=as_json)
 
 

@@ -85,7 +85,7 @@ def archive_command(out: Path, run: str | None, results: bool, as_json: bool) ->
 
     check_ending(out, ".zip")
     folder = RunDir.find(run)
-    n = housekeeping.archive(folder, out, skip=housekeeping.INTERMEDIATE if results else ())
+    n = housekeeping.archive(folder, out, skip=housekeeping.NO_RESULTS if results else ())
     if as_json:
         click.echo(json.dumps({"out": str(out), "files": n, "bytes": out.stat().st_size}))
     else:

@@ -114,8 +114,10 @@ def _findings(folder: RunDir) -> list[tuple[str, str]]:
     try:
         known = files.read_json(kept) if kept.is_file() else {}
         if known.get("digest") != digest:
-            found = inspection.inspect(folder.info()["root"], camera=dict(folder.config().camera) or None, progress=console.progress)
-            known = {"digest": digest, **found.to_dict()}
+            roots = [entry["root"] for entry in folder.recordings] or [folder.info()["root"]]
+            camera = dict(folder.config().camera) or None
+            found = [inspection.inspect(root, camera=camera, progress=console.progress).to_dict() for root in roots]
+            known = {"digest": digest, **found[0], "findings": [finding for one in found for finding in one["findings"]]}
             files.write_text(kept, json.dumps(known, indent=1) + "\n")
         return [(one["level"], f"{one['message']}: {one['advice']}".removesuffix(": ")) for one in known["findings"]]
     except (SlamError, OSError, KeyError, TypeError, AttributeError) as error:

@@ -1,6 +1,7 @@
 """How far the maps agree with what the camera saw and, for a simulated recording, with the scene it was made from."""
 
 from collections.abc import Callable, Iterable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -45,13 +46,20 @@ def octree_accuracy(run: RunDir, *, progress: Progress) -> dict[str, Any]:
 
 def has_scene(run: RunDir) -> bool:
     """Say whether a run's recording is a simulated one that brings its scene along."""
-    return (run.dataset().root / "scene.json").is_file()
+    return _scene_file(run).is_file()
+
+
+def _scene_file(run: RunDir) -> Path:
+    """Name the scene that a run's recording was made from; of several, that of the first which the maps show."""
+    placed = ((run.record("loop") or {}).get("summary", {})).get("recordings", [])
+    shown = [entry["root"] for entry, row in zip(run.recordings, placed, strict=False) if row["located"]]
+    return Path(shown[0] if shown else run.info()["root"]) / "scene.json"
 
 
 def grid_score(run: RunDir, *, progress: Progress) -> dict[str, Any]:
     """Compare the grid with the scene: shares of cells right, and whether the special boxes are in it."""
     dataset, camera, settings = run.dataset(), run.camera(), run.config().grid2d
-    scene, cells = grid_truth.read_scene(dataset.root / "scene.json"), run.load(Grid, "grid2d")
+    scene, cells = grid_truth.read_scene(_scene_file(run)), run.load(Grid, "grid2d")
     features, T_lw, truth = run.load(Features, "extract"), run.load(Ground, "densify").T_lw, trajectory_error.ground_truth(run)
     aligned = trajectory_error.ape(trajectory_error.stage_trajectory(run, "loop"), truth, n_frames=len(features.stamp), name=str(run.path))
     T_sl = aligned.T_gw @ se3.inverse(T_lw)  # a simulated recording's truth is given in its scene's frame

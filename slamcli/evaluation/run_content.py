@@ -7,7 +7,7 @@ import numpy as np
 
 from slamcli import schema
 from slamcli.errors import SlamError
-from slamcli.evaluation import map_verdict, trajectory_error
+from slamcli.evaluation import map_verdict, of_several, trajectory_error
 from slamcli.evaluation.map_verdict import Verdict
 from slamcli.evaluation.trajectory_error import Ape
 from slamcli.geometry import se3
@@ -36,6 +36,7 @@ class Content:
     loops: np.ndarray  # (C, 2) frames
     ground: Ground | None
     ape: dict[str, Ape]  # by stage; empty without ground truth
+    ape_of: list[Ape]  # of each of several recordings, after the last stage; empty where there is one
     no_truth: str  # why there is none, or ""
     x_truth: np.ndarray  # (N, 3) level frame
     states: dict[str, State]
@@ -86,6 +87,7 @@ def collect(run: RunDir) -> Content:
         loops=_loops(run, stage, map_),
         ground=ground,
         ape=ape,
+        ape_of=of_several.apes(run, ape[stage], truth) if run.recordings and truth is not None and stage in ape else [],
         no_truth=no_truth,
         x_truth=_truth_in_level(truth, ape.get(stage), T_lw),
         states=run.states(),
@@ -135,7 +137,9 @@ def _loops(run: RunDir, stage: str, map_: Map) -> np.ndarray:
 
 def _recording(run: RunDir) -> tuple[dict[str, Any], list[str]]:
     """Describe the recording and say what its reader doubts; the recording itself may be gone by now."""
-    about = {"root": run.info()["root"], "camera": run.camera().to_dict()}
+    about: dict[str, Any] = {"root": run.info()["root"], "camera": run.camera().to_dict()}
+    placed = (run.record("loop") or {}).get("summary", {}).get("recordings", [])
+    about["recordings"] = {row["name"]: f"{row['located']} of {row['frames']} frames in the common frame" for row in placed}
     try:
         return about, list(run.dataset().warnings)
     except SlamError as error:

@@ -71,7 +71,9 @@ def render(content: Content, pictures: list[Picture], inspected: Sequence[tuple[
         pictures=pictures,
         bars=bars,
         timings=timings,
-        recording=list({"folder": content.recording["root"], **content.recording["camera"]}.items()),
+        recording=list(
+            {"folder": content.recording["root"], **content.recording.get("recordings", {}), **content.recording["camera"]}.items()
+        ),
         configuration=_configuration(content),
         versions=list(_versions(content).items()),
         made=datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
@@ -134,7 +136,7 @@ def _count(name: str, value: int | None) -> Card | None:
 def _errors(content: Content) -> Table | None:
     """Tabulate the error after each stage."""
     rows = []
-    for stage, ape in content.ape.items():
+    for stage, ape in [*content.ape.items(), *((one.name, one) for one in content.ape_of)]:
         figures = ape.to_dict()
         cells = [f"{figures[key]:.4f}" for key in ("rmse", "mean", "median", "std", "max")]
         cells += [f"{figures['n_poses']} / {figures['n_frames']}", f"{figures['scale']:.4f}", f"{figures['rmse_scaled']:.4f}"]

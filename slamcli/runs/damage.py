@@ -89,10 +89,10 @@ def restored_config(records: Records) -> Config:
     return config
 
 
-def restored_info(records: Records) -> dict[str, str]:
-    """Return the name, the folder and the digest of the recording that the stages read; nothing where none recorded it."""
+def restored_info(records: Records) -> dict[str, Any]:
+    """Return the name, the folder and the digest of the recording that the stages read, and of several which they are; nothing where none recorded it."""
     for record in reversed(list(records.values())):
         recording = record.get("recording", {})
         if "dataset" in record["inputs"] and {"dataset", "root"} <= recording.keys():
-            return {"dataset": recording["dataset"], "root": recording["root"], "digest": record["inputs"]["dataset"]}
+            return {**recording, "digest": record["inputs"]["dataset"]}
     return {}

@@ -9,11 +9,12 @@ from typing import Any
 
 from slamcli import files
 from slamcli.errors import SlamError
-from slamcli.runs.run_directory import LATEST, RUNS, RunDir
+from slamcli.runs.run_directory import LATEST, RECORDINGS, RUNS, RunDir
 from slamcli.stages import NAMES
 
 DEEPEST = 3  # folders below runs/ in which runs are looked for: runs/tum/fr1_room is the deepest that slamcli makes by itself
 INTERMEDIATE = ("extract", "match", "track", "optimize")  # what only later stages read; the results are in the stages after them
+NO_RESULTS = (*INTERMEDIATE, RECORDINGS)  # folders that hold none, with those of single recordings in a run of several
 EARLIEST = (1980, 1, 1, 0, 0, 0)  # of a zip file: no clock in it, so that the same run gives the same bytes
 
 
@@ -90,7 +91,7 @@ def clean(run: RunDir) -> dict[str, int]:
         raise SlamError(f"{run.path}: loop has not been run, so there are no results to keep; finish it with: slamcli run {run.flag}")
     freed = {}
     with run.lock():
-        for stage in INTERMEDIATE:
+        for stage in NO_RESULTS:
             folder = run.path / stage
             if folder.is_dir():
                 freed[stage] = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())

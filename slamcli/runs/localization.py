@@ -20,6 +20,7 @@ from slamcli.slam.depth_tracking import FramePoints
 from slamcli.slam.localizer import Localizer
 from slamcli.slam.place_recognition import PlaceIndex
 from slamcli.sparse_map.sparse_map import SparseMap
+from slamcli.stages import measurements
 from slamcli.stages.moving_parts import coarse_images
 
 LOOKS = 2  # at all frames with hindsight: the motion that rectifies them comes from the look before
@@ -62,7 +63,9 @@ def localize(run: RunDir, recording: Dataset, *, progress: Progress) -> Localize
 def _find(run: RunDir, new: RunDir, config: Config, progress: Progress) -> Localized:
     map_, when = run.load(Map, "loop"), run.load(Timing, "loop")
     given, camera = run.camera(), run.camera("loop")
-    sparse_map = SparseMap.from_map(self_calibration.correct(run.load(Features, "extract"), given, Sensing(camera, when, {})), map_)
+    sparse_map = SparseMap.from_map(measurements.corrected(run, run.load(Features, "extract"), given, Sensing(camera, when, {})), map_)
+    if when.is_of_several:  # which of their cameras it is is not known
+        when = replace(when, depth_readout=np.array(0.0))
     features = new.load(Features, "extract")
     if new.camera() == given:  # the same camera: what the run found of it holds here too
         features = self_calibration.recalibrate(features, given, camera)

@@ -139,6 +139,10 @@ class Pipeline:
         self._opened = dataset
         self._dataset_digest: str | None = None
 
+    def keep_looks(self, looked: "Mapping[str, Sequence[Finding]]") -> None:
+        """Take what looks at recordings found, by the folder of each, to be kept with the first stage."""
+        self.looked = [finding for found in looked.values() for finding in found]
+
     # what holds
 
     def dataset(self) -> "Dataset":
@@ -266,7 +270,8 @@ class Pipeline:
         tools: Tools,
         summary: Mapping[str, Any],
     ) -> dict[str, Any]:
-        reader = self.dataset().reader if "dataset" in stage.needs else ""
+        info = self.run.info()
+        reader = self.dataset().reader if "dataset" in stage.needs or "recordings" in info else ""
         declared, code = staleness.declared(stage, self.config), source_code.of_stage(stage.name, reader)
         frames = summary.get("frames")
         return {
@@ -279,7 +284,7 @@ class Pipeline:
             "reader": reader,
             "outputs": outputs,
             "digest": files.digest({name: entry["sha256"] for name, entry in outputs.items()}),
-            "recording": {name: self.run.info()[name] for name in ("dataset", "root")},
+            "recording": {name: info[name] for name in ("dataset", "root", "recordings") if name in info},
             "environment": dict(environment()),
             "seconds": round(meter.seconds, 3),
             "cpu_seconds": round(meter.cpu_seconds, 3),

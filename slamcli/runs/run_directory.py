@@ -10,7 +10,7 @@ import logging
 import os
 import shlex
 import shutil
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
@@ -33,6 +33,7 @@ log = logging.getLogger(__name__)
 
 RUNS = Path("runs")
 LATEST = RUNS / "latest"
+RECORDINGS = "recordings"  # folder of the runs of single recordings inside a run of several
 
 
 class RunDir:
@@ -64,22 +65,30 @@ class RunDir:
         raise SlamError("no run here yet (runs/latest leads nowhere); make one with: slamcli run demo, or name one with -r")
 
     @classmethod
-    def create(cls, path: Path, *, dataset: str, root: str, digest: str) -> "RunDir":
-        """Make a run of the recording `dataset` at `root`, or open the run that is already there for the same recording."""
+    def create(cls, path: Path, *, dataset: str, root: str, digest: str, recordings: Sequence[Mapping[str, str]] = ()) -> "RunDir":
+        """Make a run of the recording `dataset` at `root`, or open the run that is already there for the same recording.
+
+        recordings : of a run of several, in their order, what each is: name, dataset, root, digest
+        """
         run = cls(path)
+        about: dict[str, Any] = {"dataset": dataset, "root": root, "digest": digest}
+        if recordings:
+            about["recordings"] = [dict(entry) for entry in recordings]
         if not _is_run(run.path):
             if run.path.is_dir() and any(not entry.name.startswith(".") for entry in run.path.iterdir()):
                 raise SlamError(f"{path}: the folder is not empty and not a run directory; name another with -r")
             run.path.mkdir(parents=True, exist_ok=True)
-            run._write_info({"dataset": dataset, "root": root, "digest": digest})
+            run._write_info(about)
             return run
         if not run._is_sealed("run.json"):  # nothing is left that would say of which recording the run is: its stages will tell
-            run._write_info({"dataset": dataset, "root": root, "digest": digest})
+            run._write_info(about)
         info = run._checked().info()
-        if info["root"] != root and info["digest"] != digest:
-            raise SlamError(f"{path}: holds a run of another recording ({info['root']}); name another folder with -r")
-        if info["root"] != root or info["digest"] != digest:
-            run._write_info({"dataset": dataset, "root": root, "digest": digest, "created": info["created"]})
+        there, here = (sorted(entry["root"] for entry in entries) or [of["root"]]
+                       for entries, of in ((info.get("recordings", []), info), (recordings, about)))  # fmt: skip
+        if there != here and info["digest"] != digest:
+            raise SlamError(_holds_another(path, there))
+        if any(info.get(name) != value for name, value in about.items() if name != "dataset"):
+            run._write_info({**about, "created": info["created"]})
         return run
 
     def _checked(self) -> "RunDir":
@@ -88,6 +97,8 @@ class RunDir:
             raise SlamError(f"{self.path}: a run of format {info.get('format')}, this slamcli reads {FORMAT}; start another with -r")
         if not all(isinstance(info.get(name), str) for name in ("dataset", "root", "digest", "created")):
             raise SlamError(f"{self.path / 'run.json'}: dataset, root, digest or created is missing; start another run with -r")
+        if not all(_is_entry(entry) for entry in info.get("recordings", [])):
+            raise SlamError(f"{self.path / 'run.json'}: a recording lacks name, dataset, root or digest; start another run with -r")
         return self
 
     def mark_latest(self) -> None:
@@ -108,6 +119,15 @@ class RunDir:
         """Return the words that make a command act on this run, for hints that are pasted whole."""
         return f"-r {shlex.quote(str(self.path))}"
 
+    @property
+    def recordings(self) -> list[dict[str, str]]:
+        """List the recordings of a run of several as ``run.json`` has them, in their order; empty for a run of one."""
+        return list(self.info().get("recordings", []))
+
+    def recording_path(self, name: str) -> Path:
+        """Name the folder of the run of one recording inside a run of several."""
+        return self.path / RECORDINGS / name
+
     def info(self) -> dict[str, Any]:
         """Read ``run.json``."""
         path = self.path / "run.json"
@@ -123,6 +143,11 @@ class RunDir:
     def _write_info(self, info: Mapping[str, Any]) -> None:
         now = datetime.now(UTC).isoformat(timespec="seconds")
         files.write_sealed(self.path / "run.json", {"format": FORMAT, "created": now, **info})
+
+    def extend(self, *, dataset: str, root: str, digest: str, recordings: Sequence[Mapping[str, str]]) -> None:
+        """Make it a run of these recordings; what was made of fewer is stale from then on. The arguments are those of `create`."""
+        about = {"dataset": dataset, "root": root, "digest": digest, "recordings": [dict(entry) for entry in recordings]}
+        self._write_info({**self.info(), **about})
 
     def config(self) -> Config:
         """Read the run's configuration; the defaults before there is any."""
@@ -169,14 +194,15 @@ class RunDir:
         return dict(sorted(found.items(), key=lambda item: (self.path / item[0] / "stage.json").stat().st_mtime_ns))
 
     def dataset(self, config: Config | None = None) -> "Dataset":
-        """Open the recording again, with the camera of `config` (the run's own)."""
-        from slamcli.datasets import open_dataset
+        """Open the recording again, or all of several, with the camera of `config` (the run's own)."""
+        config, info = config or self.config(), self.info()
+        entries = info.get("recordings", [])
+        if not entries:
+            return open_recording(info["root"], config, self.flag)
+        from slamcli.datasets.joined import JoinedDataset
 
-        root = self.info()["root"]
-        if not Path(root).exists():
-            raise SlamError(f"{root}: the recording is not there any more; put it back, or: slamcli run TARGET {self.flag}")
-        config = config or self.config()
-        return open_dataset(root, camera=dict(config.camera) or None, options=config.recording)
+        opened = [open_recording(entry["root"], config, self.flag) for entry in entries]
+        return JoinedDataset(opened, [entry["name"] for entry in entries])
 
     def camera(self, stage: str = "extract") -> "Camera":
         """Read the intrinsics that extract used, or those known after optimize or loop."""
@@ -302,7 +328,7 @@ class RunDir:
 
         Killed between the two renames of `commit`, the stage's folder is gone and its predecessor lies beside it: it is put back.
         """
-        for stage in NAMES:
+        for stage in (*NAMES, RECORDINGS):
             old = self.path / f".{stage}.old"
             if old.is_dir() and not (self.path / stage).exists():
                 old.rename(self.path / stage)
@@ -332,12 +358,33 @@ class RunDir:
         shutil.rmtree(old, ignore_errors=True)
 
 
+def open_recording(root: str, config: Config, flag: str) -> "Dataset":
+    """Open a recording that a run was made of; SlamError where it is gone, with the run's `flag` in the advice."""
+    from slamcli.datasets import open_dataset
+
+    if not Path(root).exists():
+        raise SlamError(f"{root}: the recording is not there any more; put it back, or: slamcli run TARGET {flag}")
+    return open_dataset(root, camera=dict(config.camera) or None, options=config.recording)
+
+
 def default_path(dataset: str) -> Path:
     """Name the run directory of a recording; SlamError for a name that would not stay under ``runs/``."""
     parts = Path(dataset).parts
     if not parts or ".." in parts or Path(dataset).is_absolute() or dataset == LATEST.name:
         raise SlamError(f"no run directory can be named after a recording called {dataset!r}; name one with -r")
     return RUNS / dataset
+
+
+def _holds_another(path: Path, roots: list[str]) -> str:
+    told = f"another recording ({roots[0]})" if len(roots) == 1 else f"other recordings ({', '.join(roots)})"
+    return f"{path}: holds a run of {told}; name another folder with -r, or add to that map with: slamcli add {shlex.quote(str(path))} RECORDING"
+
+
+def _is_entry(entry: Any) -> bool:
+    """Say whether a recording is described as runs of several list it; its name is a folder's, and cannot lead elsewhere."""
+    if not isinstance(entry, dict) or not all(isinstance(entry.get(name), str) for name in ("name", "dataset", "root", "digest")):
+        return False
+    return bool(entry["name"]) and Path(entry["name"]).name == entry["name"] and not entry["name"].startswith(".")
 
 
 def _is_run(path: Path) -> bool:

@@ -16,6 +16,7 @@ PACKAGE = Path(__file__).parents[1]
 DIGITS = 12  # hexadecimal, of a file's digest: chance equality of two states of a file is out of the question
 SHOWN = 3  # changed files that a reason names
 READING = "datasets/__init__.py"  # through it the pipeline opens the recording for a stage that needs one
+JOINING = ["datasets/joined.py", "stages/joining.py"]  # of several recordings
 READERS = "datasets/readers/"  # loaded by name, one for each layout
 
 # Reached by imports, yet without influence on what a stage computes from its inputs.
@@ -42,11 +43,14 @@ IMPORT = re.compile(r"^ *(?:from +(slamcli[\w.]*) +import +(\([^)]*\)|.*)|import
 def of_stage(name: str, reader: str = "") -> Mapping[str, str]:
     """Return the digest of every file that a stage can reach, by its name within the package. They are read once a process.
 
-    reader : the layout of the recording, whose reader counts for a stage that needs the recording; "" = none
+    reader : the layout of the recording, whose reader counts for a stage that needs the recording; "" = none. Of several recordings
+        it is "joined" and their layouts, with "+" between them
     """
     start = [f"stages/{name}.py"]
     if "dataset" in stage_named(name).needs:
-        start += [READING] + [file for file in [f"{READERS}{reader}.py"] if reader and _is_file(file)]
+        start += [READING] + [file for file in (f"{READERS}{one}.py" for one in reader.split("+")) if _is_file(file)]
+    if reader.startswith("joined+"):
+        start += JOINING
     return {file: _digest(file) for file in sorted(reachable(start))}
 
 

@@ -46,7 +46,11 @@ def _trajectory(records: dict[str, Any]) -> list[str]:
     n_frames, loop = records["extract"]["summary"]["frames"], records["loop"]["summary"]
     apart = loop.get("apart", 0)
     told = f"{n_frames - loop['lost'] - apart} of {n_frames} frames, {loop['closures']} loop{'s' * (loop['closures'] != 1)} closed"
-    return ["trajectory", f"{told}, {apart} frames in segments apart" if apart else told, "loop/trajectory.txt"]
+    if "recordings" in loop:
+        n_joined, n = sum(row["located"] > 0 for row in loop["recordings"]), len(loop["recordings"])
+        told = f"{n_joined} of {n} recordings in one frame: {told}"
+    file = "loop/trajectory_<recording>.txt" if "recordings" in loop else "loop/trajectory.txt"
+    return ["trajectory", f"{told}, {apart} frames in segments apart" if apart else told, file]
 
 
 def _cost(records: dict[str, Any]) -> list[str]:
@@ -57,7 +61,8 @@ def _cost(records: dict[str, Any]) -> list[str]:
 
 def next_commands(run: RunDir) -> list[str]:
     """List the commands that come next for this run, each to be pasted as it is."""
-    has_truth = (Path(run.info()["root"]) / "groundtruth.txt").is_file()
+    roots = [entry["root"] for entry in run.recordings] or [run.info()["root"]]
+    has_truth = any((Path(root) / "groundtruth.txt").is_file() for root in roots)
     which = run.flag
     return [
         *([f"slamcli eval ape {which}"] if has_truth else []),

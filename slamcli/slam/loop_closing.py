@@ -11,10 +11,16 @@ from slamcli.schema import Words
 from slamcli.slam import loop_pose_graph, map_merging
 from slamcli.slam.loop_candidates import Candidate, Claims, find_alike, find_by_pose, first_of_each_revisit
 from slamcli.slam.loop_verification import verify
+from slamcli.slam.map_merging import Join
 from slamcli.slam.place_recognition import PlaceIndex
 from slamcli.sparse_map import map_adjustment
 from slamcli.sparse_map.landmark_fusion import fuse_landmarks
 from slamcli.sparse_map.sparse_map import SparseMap
+
+
+def no_objection(found: Join) -> str:
+    """Object to no join: parts of one recording are joined when several closures agree."""
+    return ""
 
 
 class LoopCloser:
@@ -30,10 +36,15 @@ class LoopCloser:
         rng: np.random.Generator,
         *,
         progress: Callable[..., Iterable],
+        objection: Callable[[Join], str] = no_objection,
     ) -> None:
-        """Take the map with the words of the recording that it is of; progress : wraps the candidates while they are verified."""
+        """Take the map with the words of the recording that it is of.
+
+        progress : wraps the candidates while they are verified; objection : says why two segments cannot be one place, "" when they can
+        """
         self._sparse_map, self._words, self._camera = sparse_map, words, camera
         self._settings, self._sensor, self._rng, self._progress = settings, sensor, rng, progress
+        self._objection = objection
         self._places = PlaceIndex(words, sparse_map.kf.frame)
         self.fate: dict[tuple[int, int], Candidate] = {}
 
@@ -56,6 +67,11 @@ class LoopCloser:
         left = [c for c in tried if c.is_accepted]
         self._note(c for c in tried if not c.is_accepted)
         while found := map_merging.find_join(self._sparse_map, left, least=self._settings.join_closures):
+            if reason := self._objection(found):
+                claims = {(c.kf_i, c.kf_j) for c in found.closures}
+                self._note(c.rejected(reason) for c in found.closures)
+                left = [c for c in left if (c.kf_i, c.kf_j) not in claims]
+                continue
             map_merging.join(self._sparse_map, found)
             self._fuse_and_adjust(first_of_each_revisit(found.closures, span=self._settings.closure_spacing))
             self._note(found.closures)

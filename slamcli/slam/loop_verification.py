@@ -62,6 +62,14 @@ def verify(
     return _find_landmarks(sparse_map, candidate, frame_i, T_iw, camera, settings)
 
 
+def find_again(
+    sparse_map: SparseMap, candidate: Candidate, T_iw: np.ndarray, camera: Camera, settings: LoopConfig, sensor: SensorConfig
+) -> Candidate:
+    """Look for the landmarks around key frame j in key frame i, from a guess of its pose T_iw in the world that j stands in."""
+    frame_i = frame_features(sparse_map.features, int(sparse_map.kf.frame[candidate.kf_i]), camera, sensor)
+    return _find_landmarks(sparse_map, candidate, frame_i, T_iw, camera, settings)
+
+
 def _find_landmarks(
     sparse_map: SparseMap,
     candidate: Candidate,

@@ -19,6 +19,7 @@ from slamcli.depth.coarse_images import CoarseImages
 from slamcli.geometry import se3
 from slamcli.geometry.algebra import product
 from slamcli.geometry.camera import Camera
+from slamcli.geometry.common_camera import Retelling
 from slamcli.schema import Features
 from slamcli.slam import moving_object_kernels as kernels
 
@@ -140,6 +141,13 @@ def weigh(views: Views, frame: int, after: tuple[float, ...]) -> Evidence | None
     others = _others(views, frame, after) if views.depth.size else np.zeros(0, dtype=np.int64)
     if len(others) == 0 or not np.isfinite(views.T_wc[frame, 0, 0]):
         return None
+    middle, seen = seen_from(views, frame, others)
+    is_long = np.abs(views.stamp[others] - views.stamp[frame]) >= LONG
+    return Evidence(middle, (seen == kernels.THROUGH).sum(axis=0), (seen[is_long] == kernels.AGAIN).sum(axis=0))
+
+
+def seen_from(views: Views, frame: int, others: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Look from other views (N,) at what one shows: depth (v, u) [m], 0 = unknown, and what each says of it, (N, v, u), as the kernel `compare` has it."""
     small, row_at = icp.coarse_camera(views.camera)
     place = np.where(row_at < small.width * small.height, row_at, -1).astype(np.int32)
     raw = np.append(views.depth[frame].ravel(), np.uint16(0))
@@ -149,10 +157,8 @@ def weigh(views: Views, frame: int, after: tuple[float, ...]) -> Evidence | None
     seen = np.zeros((len(others), *shape(views.camera)), dtype=np.uint8)
     images = views.depth.of(others)
     kernels.compare(z, kernels.smooth_places(z, SMOOTH), STEP, images, place, T, pinhole, TOLERANCE, icp.UNIT, seen)
-    is_long = np.abs(views.stamp[others] - views.stamp[frame]) >= LONG
     rows, columns = seen.shape[1:]
-    middle = np.ascontiguousarray(z[STEP // 2 :: STEP, STEP // 2 :: STEP][:rows, :columns])
-    return Evidence(middle, (seen == kernels.THROUGH).sum(axis=0), (seen[is_long] == kernels.AGAIN).sum(axis=0))
+    return np.ascontiguousarray(z[STEP // 2 :: STEP, STEP // 2 :: STEP][:rows, :columns]), seen
 
 
 def _others(views: Views, frame: int, after: tuple[float, ...]) -> np.ndarray:
@@ -210,6 +216,20 @@ def hide_pixels(depth: np.ndarray, mask: np.ndarray, camera: Camera) -> np.ndarr
     return np.where(
         np.append(with_margin(mask, MAP_MARGIN).ravel(), False)[_lookup(camera, _side(camera), mask.shape)], np.float32(np.nan), depth
     )
+
+
+def retold(moving: np.ndarray, own: Camera, common: Camera) -> np.ndarray:
+    """Tell what moves in the views of camera `own`, (F, v, u) bool, in the blocks of camera `common` at the same place."""
+    how = Retelling(common, own)
+    if how.is_identity:
+        return np.asarray(moving)
+    rows, columns = shape(common)
+    row, column = np.mgrid[0:rows, 0:columns]
+    middle = (np.stack([column, row], axis=-1) + 0.5) * _side(common) - 0.5
+    column, row = (how.pixels(middle)[..., k] + 0.5 for k in (0, 1))
+    column, row = (np.floor(value / _side(own)).astype(np.int64) for value in (column, row))
+    inside = (row >= 0) & (column >= 0) & (row < moving.shape[1]) & (column < moving.shape[2])
+    return moving[:, np.where(inside, row, 0), np.where(inside, column, 0)] & inside
 
 
 def with_margin(mask: np.ndarray, places: int = 1) -> np.ndarray:

@@ -68,7 +68,7 @@ def assemble(found: list[Frame], inputs: Inputs, out: Path, cfg: Config, tools: 
     artifacts.save(features, out)
     artifacts.save(_coarse_table(camera, found), out)
     artifacts.save(_flow_table(dataset, camera, found, tools) if cfg.extract.flow else Flow(), out)
-    _write_association(out / "frames.txt", dataset, features.depth_stamp)
+    write_association(out / "frames.txt", dataset, features.depth_stamp)
     write_camera(out, camera)
     doubts, n = _doubts(dataset, found, features), np.diff(features.offset)
     for one in doubts:
@@ -179,7 +179,7 @@ def _flow_table(dataset: Dataset, camera: Camera, found: list[Frame], tools: Too
     return Flow(flow_xy=raw)
 
 
-def _write_association(path: Path, dataset: Dataset, depth_stamp: np.ndarray) -> None:
+def write_association(path: Path, dataset: Dataset, depth_stamp: np.ndarray) -> None:
     """Write which depth image goes with which colour image, in the format of the TUM tools: stamp, path, stamp, path."""
     lines = ["# colour stamp [s], colour image, depth stamp [s], depth image; commented out: no usable depth image"]
     for stamp, colour, with_depth, depth in zip(dataset.stamp, dataset.colour_name, depth_stamp, dataset.depth_name, strict=True):

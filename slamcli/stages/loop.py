@@ -7,19 +7,19 @@ from pathlib import Path
 import numpy as np
 
 from slamcli import artifacts, files
-from slamcli.calibration import self_calibration
 from slamcli.calibration.self_calibration import Sensing
 from slamcli.config.options import Config
 from slamcli.errors import SlamError
 from slamcli.formats.g2o import write_g2o
-from slamcli.schema import LOST, Closures, Map, Moving, Rests, Timing, Tracks, Words, frame_segments
+from slamcli.schema import LOST, Closures, DepthTimes, Map, Moving, Recordings, Rests, Timing, Tracks, Words, frame_segments
 from slamcli.slam import doubt, final_refinement, loop_pose_graph, map_segments, pose_doubt
+from slamcli.slam.common_place import Jury
 from slamcli.slam.depth_tracking import FramePoints
 from slamcli.slam.loop_candidates import Candidate
-from slamcli.slam.loop_closing import LoopCloser
+from slamcli.slam.loop_closing import LoopCloser, no_objection
 from slamcli.slam.moving_objects import FOR_MAPS
 from slamcli.sparse_map.sparse_map import SparseMap
-from slamcli.stages import moving_parts
+from slamcli.stages import measurements, moving_parts, of_several
 from slamcli.stages.camera_file import write_camera
 from slamcli.stages.contract import Inputs, Summary, Tools
 from slamcli.stages.map_outputs import describe_other_segments, save_map, segment_file
@@ -32,11 +32,12 @@ def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
     given, sensing = inputs.camera(), Sensing(camera, when, {})
     moving = inputs.load(Moving, "track")
     features, depth = moving_parts.still(inputs, moving)
-    features = self_calibration.correct(features, given, sensing)
+    features = measurements.corrected(inputs, features, given, sensing)
     sparse_map = SparseMap.from_map(features, inputs.load(Map, "optimize"))
     tried: list[Candidate] = []
     if cfg.loop.enabled and len(sparse_map.kf) > 2:
-        closer = LoopCloser(sparse_map, words, camera, cfg.loop, cfg.sensor, tools.rng(), progress=tools.progress)
+        objection = Jury(sparse_map, depth, camera, cfg.loop, cfg.sensor).objection if when.is_of_several else no_objection
+        closer = LoopCloser(sparse_map, words, camera, cfg.loop, cfg.sensor, tools.rng(), progress=tools.progress, objection=objection)
         tried = closer.close_loops()
     accepted = [c for c in tried if c.is_accepted]
     if accepted and cfg.loop.final_refinement:
@@ -57,10 +58,14 @@ def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
     map_ = map_segments.anchored(main_first(sparse_map.snapshot(), tracks, cfg.loop.main_segment), tracks)
     write_pose_graph(out / "posegraph.g2o", map_.T_wk, loop_pose_graph.build(sparse_map, accepted, cfg.loop))
     write_candidates(out / "candidates.csv", tried)
-    for segment, told in enumerate(describe_other_segments(tracks, map_), start=1):
-        tools.warn(f"{told}, could not be joined: their poses, in a frame of their own, are in {segment_file(segment)}; no map shows them")
+    several = place_recordings(inputs, out, tracks, map_) if when.is_of_several else None
+    for apart in several.warnings() if several is not None else segments_apart(tracks, map_):
+        tools.warn(apart)
     save_map(out, features.stamp, tracks, map_)
     moving = moving_parts.find(inputs, tracks, map_, tools, rule=FOR_MAPS) if len(moving.moving) else moving
+    motion = moving_parts.figures(moving)
+    if several is not None:
+        moving = moving_parts.with_gone(inputs, moving, several.recording_of_frame, tracks, map_, tools)
     artifacts.save(moving, out)
     first = inputs.load(Tracks, "track"), inputs.load(Map, "track")
     doubts = pose_doubt.judge(moving_parts.views(inputs, tracks, map_), moving.moving, first, (tracks, map_))
@@ -68,20 +73,34 @@ def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
     artifacts.save(when, out)
     write_camera(out, camera)
     artifacts.save(closures_of(accepted), out)
-    return (
-        {
-            "frames": len(features.stamp),
-            "candidates": len(tried),
-            "closures": len(accepted),
-            "segments": map_segments.n_segments(map_),
-            "lost": int((tracks.state == LOST).sum()),
-            "apart": int((frame_segments(tracks, map_) > 0).sum()),
-            "landmarks": len(map_.lm_xyz),
-            "doubtful": int(doubts.is_doubtful.sum()),
-        }
-        | moving_parts.figures(moving)
-        | doubt.to_summary(pose_doubt.findings(doubts))
-    )
+    figures: Summary = {
+        "frames": len(features.stamp),
+        "candidates": len(tried),
+        "closures": len(accepted),
+        "segments": map_segments.n_segments(map_),
+        "lost": int((tracks.state == LOST).sum()),
+        "apart": int((frame_segments(tracks, map_) > 0).sum()),
+        "landmarks": len(map_.lm_xyz),
+        "doubtful": int(doubts.is_doubtful.sum()),
+    }
+    if several is not None:
+        figures["recordings"] = several.counts()
+    return figures | motion | doubt.to_summary(pose_doubt.findings(doubts))
+
+
+def place_recordings(inputs: Inputs, out: Path, tracks: Tracks, map_: Map) -> of_several.Placed:
+    """Say where the recordings of a run of several came to lie, and write what such a run has besides."""
+    placed = of_several.Placed(of_several.recording_names(inputs), inputs.load(Recordings, "extract"), tracks, map_)
+    placed.save(out, inputs.load(DepthTimes, "optimize"))
+    return placed
+
+
+def segments_apart(tracks: Tracks, map_: Map) -> list[str]:
+    """Say which map segments could not be joined."""
+    return [
+        f"{told}, could not be joined: their poses, in a frame of their own, are in {segment_file(segment)}; no map shows them"
+        for segment, told in enumerate(describe_other_segments(tracks, map_), start=1)
+    ]
 
 
 def main_first(map_: Map, tracks: Tracks, main: int) -> Map:

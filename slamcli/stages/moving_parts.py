@@ -5,7 +5,7 @@ import numpy as np
 from slamcli.depth.coarse_images import CoarseImages
 from slamcli.geometry.camera import Camera
 from slamcli.schema import CoarseDepth, Features, Map, Moving, Tracks, poses_in_segments
-from slamcli.slam import moving_objects
+from slamcli.slam import gone_objects, moving_objects
 from slamcli.slam.moving_objects import FOR_POSES, Rule, Views
 from slamcli.stages.contract import Inputs, Stored, Summary, Tools
 
@@ -28,6 +28,15 @@ def find(inputs: Inputs, tracks: Tracks, map_: Map, tools: Tools, *, rule: Rule 
 def coarse_images(inputs: Stored) -> CoarseImages:
     """Return the recording's coarse depth images."""
     return CoarseImages(inputs.load(CoarseDepth, "extract"))
+
+
+def with_gone(inputs: Inputs, moving: Moving, recording: np.ndarray, tracks: Tracks, map_: Map, tools: Tools) -> Moving:
+    """Add to what moves, for the maps, what stood in one recording and is gone in a later one; recording : (F,) number of each frame's."""
+    seen = views(inputs, tracks, map_)
+    gone = gone_objects.find(seen, recording, np.asarray(map_.kf_frame), lambda frames: tools.progress(frames, "gone objects", len(frames)))
+    if not gone.any():
+        return moving
+    return Moving(gone | moving.moving if len(moving.moving) else gone)
 
 
 def still(inputs: Stored, moving: Moving) -> tuple[Features, CoarseImages]:
