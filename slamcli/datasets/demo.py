@@ -5,7 +5,7 @@ from pathlib import Path
 
 from slamcli.datasets.simulate import simulate
 
-VERSION = 3  # raised whenever the simulated images change: an older cached demo is then no longer used
+VERSION = 4  # raised whenever the simulated images change: an older cached demo is then no longer used
 SEED = 7
 FRAMES = 320
 

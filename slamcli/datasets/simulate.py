@@ -86,7 +86,7 @@ class Simulation:
 def simulate(out: Path, *, progress: Progress, workers: int = 2, **settings: object) -> Path:
     """Write a simulated recording into the new folder `out`; see Simulation for the settings.
 
-    The same settings give the same bytes on the same machine, and all but a few pixels on another. The folder appears only when complete.
+    The same settings give the same bytes. The folder appears only when complete.
     """
     what = Simulation(**settings)  # type: ignore[arg-type]
     _check(what)
@@ -263,6 +263,7 @@ def _write_images(
     normal_noise, camera = noise.NormalNoise((what.height, what.width), what.seed), what.camera()
 
     def one(i: int) -> None:
+        cv2.ipp.setUseIPP(False)  # each thread has a switch of its own, beside `least_instructions_in_opencv`
         rng = np.random.default_rng([what.seed, 3, i, *([what.take] if what.take else [])])
         shown = i < int(what.gone_from * n)
         rgb, depth, cosine = renderer.render(motion.colour_T_lc[i], with_movable=shown)
