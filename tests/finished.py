@@ -65,8 +65,10 @@ def write_recording(folder: Path, stamp: np.ndarray, truth: Trajectory | None) -
         write_tum(folder / "groundtruth.txt", truth)
 
 
-def make(folder: Path, *, seed: int = 0, frames: int = 90, n_lost: int = 6, with_truth: bool = True, until: str = "densify") -> Finished:
-    """Make recording and run below `folder`, with `n_lost` lost frames from the middle on."""
+def make(
+    folder: Path, *, seed: int = 0, frames: int = 90, n_lost: int = 6, with_truth: bool = True, until: str = "densify", n_doubtful: int = 0
+) -> Finished:
+    """Make recording and run below `folder`, with `n_lost` lost frames from the middle on, and as many doubtful ones more as said."""
     rng = np.random.default_rng(seed)
     stamp = np.round(START + np.arange(frames) / RATE, 6)
     truth = wander(rng, stamp)
@@ -76,7 +78,7 @@ def make(folder: Path, *, seed: int = 0, frames: int = 90, n_lost: int = 6, with
     run.write_config(Config())
     lost = np.zeros(frames, dtype=bool)
     lost[frames // 2 : frames // 2 + n_lost] = True
-    results = _results(rng, truth, lost)
+    results = _results(rng, truth, lost, n_doubtful)
     for stage in STAGES:
         with run.writing(stage.name) as out:
             for value in results.get(stage.name, ()):
@@ -94,7 +96,7 @@ def make(folder: Path, *, seed: int = 0, frames: int = 90, n_lost: int = 6, with
     return Finished(run=path, recording=recording, truth=truth, lost=lost)
 
 
-def _results(rng: np.random.Generator, truth: Trajectory, lost: np.ndarray) -> dict[str, tuple]:
+def _results(rng: np.random.Generator, truth: Trajectory, lost: np.ndarray, n_doubtful: int) -> dict[str, tuple]:
     frames = len(truth.stamp)
     no_rows = np.zeros(frames + 1, np.int64)
     features = Features(
@@ -115,7 +117,13 @@ def _results(rng: np.random.Generator, truth: Trajectory, lost: np.ndarray) -> d
     maps = {name: _map(T_wc[kf_frame], kf_frame) for name, T_wc in (("track", found["track"].T_wc), ("loop", found["loop"].T_wc))}
     when = Timing(readout=np.array(0.0), depth_readout=np.array(0.0), depth_delay=np.array(0.0), twist=np.zeros((frames, 6)))
     unknown, sure = np.full(frames, np.nan, np.float32), np.full(frames, 0.003, np.float32)
-    doubts = Doubt(contradicted=unknown, disagreement=unknown, sigma=sure, is_doubtful=lost.copy())
+    doubts = Doubt(
+        contradicted=unknown,
+        disagreement=unknown,
+        sigma=sure,
+        drift=np.zeros(frames, np.float32),
+        is_doubtful=lost | (np.arange(frames) < n_doubtful),
+    )
     return {
         "extract": (features,),
         "track": (track, Moving(), maps["track"]),

@@ -129,7 +129,7 @@ class Localizer:
     def _record_by_background(self, i: int, frame: FrameFeatures) -> Location:
         """Place frame `i` where the background's motion takes the frame before it: no landmark holds it."""
         kf = int(self.poses.ref_kf[i - 1])
-        self.poses.attach(i, kf, self.poses.predict(i, i - 1), state=ON_DEPTH, n_inliers=0, is_anchored=False)
+        self.poses.attach(i, kf, self.poses.predict(i, i - 1), state=TRACKED, n_inliers=0, is_anchored=False)
         return Location(nothing_seen(frame), None)
 
     def _relocalize(self, i: int, frame: FrameFeatures) -> MapMatch | None:

@@ -5,9 +5,13 @@
 * Tracking and the final pass disagree about the motion within half a second.
 * Few landmarks hold the pose, and no depth image in their stead; or it is unknown.
 * Most of the view moves.
+* Where things move, frames between this one and those that landmarks hold best are held by few, or by none: what each of them may be off
+  adds up. Where nothing moves depth holds such frames, and the path of somebody who fills the view is not taken for the camera's.
 """
 
 import numpy as np
+from scipy import sparse
+from scipy.sparse import csgraph
 
 from slamcli.geometry import se3
 from slamcli.geometry.algebra import product
@@ -25,6 +29,11 @@ CONTRADICTED = 0.03  # share of the surface; right poses leave 0.01 on real reco
 DISAGREEMENT = 0.03  # [m]
 DOUBTFUL_SIGMA = 0.03  # [m]
 MOVING = 0.6  # share of a view
+# [m] by which the motion from one frame to the next errs over the number of landmarks, at best, where few hold it, where no static world shows
+STEP_LANDMARK_SIGMA, STEP_BEST, STEP_WORST, STEP_BLIND = 0.15, 0.001, 0.004, 0.02
+TIED = 30  # landmarks that two key frames share, so that nothing that happened between them tears them apart
+TIE_SIGMA = 0.003  # [m] of their relative pose
+DOUBTFUL_DRIFT = 0.03  # [m]
 
 
 def judge(views: Views, moving: np.ndarray, first: tuple[Tracks, Map], final: tuple[Tracks, Map]) -> Doubt:
@@ -41,13 +50,50 @@ def judge(views: Views, moving: np.ndarray, first: tuple[Tracks, Map], final: tu
     sigma = np.sqrt(BASE_SIGMA**2 + support**2 + np.nan_to_num(disagreement) ** 2)
     is_doubtful = (sigma > DOUBTFUL_SIGMA) | (np.nan_to_num(contradicted) > CONTRADICTED) | (share > MOVING) | (tracks.ref_kf < 0)
     is_doubtful |= np.nan_to_num(disagreement) > DISAGREEMENT
+    is_blind = (np.nan_to_num(contradicted) > CONTRADICTED) | (share > MOVING) | (tracks.ref_kf < 0)
+    drift = _drift(tracks, final[1], is_blind) if len(moving) else np.zeros(n)
+    is_doubtful |= drift > DOUBTFUL_DRIFT
     sigma = np.where(tracks.ref_kf >= 0, sigma, np.nan)
     return Doubt(
         contradicted=contradicted.astype(np.float32),
         disagreement=disagreement.astype(np.float32),
         sigma=sigma.astype(np.float32),
+        drift=drift.astype(np.float32),
         is_doubtful=is_doubtful,
     )
+
+
+def _drift(tracks: Tracks, map_: Map, is_blind: np.ndarray) -> np.ndarray:
+    """Estimate the standard deviation (F,) [m] of each frame's position beside the longest stretch of frames that landmarks hold well.
+
+    is_blind : (F,) frames that show no static world, or contradict it
+    Variances add up along the shortest way there: from frame to frame, and from key frame to key frame that see the same.
+    """
+    n = len(is_blind)
+    step = np.clip(STEP_LANDMARK_SIGMA / np.maximum(tracks.n_inliers, 1), STEP_BEST, STEP_WORST)
+    step[is_blind] = STEP_BLIND
+    frames = np.arange(n - 1)
+    variance = np.maximum(step[1:], step[:-1]) ** 2
+    ties = _ties(map_)
+    row, column = np.concatenate([frames, ties[:, 0]]), np.concatenate([frames + 1, ties[:, 1]])
+    value = np.concatenate([variance, np.full(len(ties), TIE_SIGMA**2)])
+    order = np.argsort(-value, kind="stable")  # of several ways between two frames, the last one written is the best
+    graph = sparse.lil_matrix((n, n))
+    graph[row[order], column[order]] = value[order]
+    held = doubt.doubtful_frames(step <= np.quantile(step, 0.5))  # stretches at least as well held as half of the frames
+    first, last = max(held, key=lambda stretch: stretch[1] - stretch[0])
+    away = csgraph.dijkstra(graph.tocsr(), directed=False, indices=(first + last) // 2)
+    return np.sqrt(away)
+
+
+def _ties(map_: Map) -> np.ndarray:
+    """List pairs (N, 2) of frames, both key frames, that at least TIED landmarks were seen first and last in."""
+    if len(map_.obs_lm) == 0:
+        return np.zeros((0, 2), dtype=np.int64)
+    starts = np.flatnonzero(np.diff(map_.obs_lm, prepend=-1))
+    ends = np.append(starts[1:], len(map_.obs_lm)) - 1
+    pairs, n_shared = np.unique(np.stack([map_.obs_kf[starts], map_.obs_kf[ends]], axis=1), axis=0, return_counts=True)
+    return map_.kf_frame[pairs[(n_shared >= TIED) & (pairs[:, 0] != pairs[:, 1])]].astype(np.int64)
 
 
 def findings(record: Doubt) -> list[Finding]:

@@ -153,6 +153,22 @@ def test_export_trajectory(slamcli: Command, made: finished.Finished, tmp_path: 
     assert slamcli("export-trajectory", tmp_path / "no" / "t.txt", "-r", made.run).exit_code == 1
 
 
+def test_export_of_the_sure_leaves_out_what_the_run_doubts_and_nothing_else(slamcli: Command, tmp_path: Path) -> None:
+    made = finished.make(tmp_path, n_doubtful=10)
+    run, doubtful = made.run, made.lost | (np.arange(90) < 10)
+    result = slamcli("export-trajectory", tmp_path / "all.txt", "-r", run)
+    assert result.exit_code == 0, result.stderr
+    result = slamcli("export-trajectory", tmp_path / "sure.txt", "-r", run, "--sure-only")
+    assert result.exit_code == 0, result.stderr
+    assert "74 poses of 90 frames" in result.stderr
+    whole, sure = read_tum(tmp_path / "all.txt"), read_tum(tmp_path / "sure.txt")
+    kept = np.isin(whole.stamp, made.truth.stamp[~doubtful])
+    np.testing.assert_array_equal(sure.stamp, whole.stamp[kept])
+    np.testing.assert_array_equal(sure.T_wc, whole.T_wc[kept])
+    figures = json.loads(slamcli("eval", "ape", "-r", run, "--json").stdout)
+    assert figures["doubtful"] == 16 and figures["rmse_sure"] != figures["rmse"]
+
+
 def test_map_against_the_depth_images_and_the_scene(slamcli: Command, room_run: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
     shutil.copytree(room_run, run)

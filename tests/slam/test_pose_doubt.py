@@ -1,0 +1,106 @@
+"""Doubt about single poses: right ones are sure, wrong ones are not, and what a blind stretch may have torn apart is told."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from boxroom import FURNITURE, KINECT, look_along, render
+from kinect import coded
+
+from slamcli.depth import icp
+from slamcli.geometry import se3
+from slamcli.schema import TRACKED, Doubt, Map, Tracks
+from slamcli.slam import moving_objects, pose_doubt
+from slamcli.slam.moving_objects import Views
+
+FRAMES, RATE = 40, 15.0
+NOTHING = np.zeros((0, 0, 0), dtype=bool)
+
+
+@cache
+def room() -> tuple[Views, np.ndarray]:
+    """A drive through the empty room; views with the true poses, and these."""
+    T_wc = np.array([look_along([1.2 + 0.04 * i, 2.9, 0.9], 0.02 * np.sin(i / 5), 0.15) for i in range(FRAMES)])
+    depth = coded([icp.coarsen(render(T, KINECT, boxes=FURNITURE)) for T in T_wc])
+    return Views(depth, np.arange(FRAMES) / RATE, T_wc, np.zeros(FRAMES, dtype=np.int64), KINECT), T_wc
+
+
+def found(T_wc: np.ndarray, n_inliers: np.ndarray | int = 200, ties: tuple[tuple[int, int], ...] = ()) -> tuple[Tracks, Map]:
+    """Tracks of these poses, each frame a key frame; `ties` : pairs of frames that see the same 50 landmarks."""
+    n = len(T_wc)
+    tracks = Tracks(
+        ref_kf=np.arange(n, dtype=np.int32), T_kc=np.tile(np.eye(4), (n, 1, 1)), state=np.full(n, TRACKED, np.uint8),
+        n_inliers=np.broadcast_to(n_inliers, n).astype(np.int32),
+    )  # fmt: skip
+    obs_kf = np.array([frame for pair in ties for _ in range(50) for frame in pair], np.int32)
+    obs_lm = np.repeat(np.arange(len(obs_kf) // 2, dtype=np.int32), 2)
+    frames = np.arange(n, dtype=np.int32)
+    map_ = Map(frames, np.zeros(n, np.int32), T_wc, np.zeros((len(obs_kf) // 2, 3)), obs_lm, obs_kf, np.zeros(len(obs_kf), np.int64))
+    return tracks, map_
+
+
+def judged(T_wc: np.ndarray, *, first: np.ndarray | None = None, moving: np.ndarray = NOTHING, **held: object) -> Doubt:
+    poses = found(T_wc, **held)
+    return pose_doubt.judge(replace(room()[0], T_wc=T_wc), moving, poses if first is None else found(first), poses)
+
+
+def test_right_poses_are_sure() -> None:
+    record = judged(room()[1])
+    assert not record.is_doubtful.any() and (record.drift == 0.0).all() and (record.sigma < 0.01).all()
+    assert pose_doubt.findings(record) == []
+
+
+def test_a_camera_believed_to_rest_while_it_moves_is_contradicted_by_what_it_sees() -> None:
+    record = judged(np.tile(np.eye(4), (FRAMES, 1, 1)))
+    assert record.is_doubtful.mean() > 0.4
+    (finding,) = pose_doubt.findings(record)
+    assert finding.is_grave and "look through" in finding.text
+
+
+def test_passes_that_disagree_about_a_jump_are_doubtful_around_it_and_nowhere_else() -> None:
+    true = room()[1]
+    first = true.copy()
+    first[20:] = se3.exp(np.array([0.1, 0.0, 0.0, 0.0, 0.0, 0.0])) @ first[20:]
+    record = judged(true, first=first)
+    assert record.is_doubtful[20:26].all() and not record.is_doubtful[:20].any() and not record.is_doubtful[30:].any()
+    assert not pose_doubt.findings(record)[0].is_grave
+
+
+def test_frames_that_few_landmarks_hold_are_doubtful_and_the_lost_have_no_sigma() -> None:
+    few = np.where(np.arange(FRAMES) == 7, 5, 200)
+    tracks, map_ = found(room()[1], n_inliers=few)
+    ref_kf = tracks.ref_kf.copy()
+    ref_kf[30] = -1
+    poses = replace(tracks, ref_kf=ref_kf), map_
+    record = pose_doubt.judge(room()[0], NOTHING, poses, poses)
+    assert np.flatnonzero(record.is_doubtful).tolist() == [7, 30] and np.flatnonzero(np.isnan(record.sigma)).tolist() == [30]
+
+
+def covered(frames: range) -> np.ndarray:
+    """Masks in which most of the view moves in these frames."""
+    moving = np.zeros((FRAMES, *moving_objects.shape(KINECT)), dtype=bool)
+    moving[frames.start : frames.stop, :, :-8] = True
+    return moving
+
+
+def test_what_lies_beyond_a_stretch_without_a_static_world_is_doubtful_too() -> None:
+    record = judged(room()[1], moving=covered(range(25, 32)))
+    assert not record.is_doubtful[:25].any() and record.is_doubtful[25:].all()
+    assert record.drift[-1] == pytest.approx(np.sqrt(8) * pose_doubt.STEP_BLIND, rel=0.05)
+
+
+def test_landmarks_seen_before_and_after_tie_both_sides_together() -> None:
+    record = judged(room()[1], moving=covered(range(25, 32)), ties=((20, 35),))
+    assert record.is_doubtful[25:32].all() and not record.is_doubtful[:25].any() and not record.is_doubtful[33:].any()
+    assert record.drift.max() < np.sqrt(4) * pose_doubt.STEP_BLIND + 0.01
+
+
+def test_few_landmarks_drift_only_where_things_move() -> None:
+    weak = np.where(np.arange(FRAMES) >= 25, 16, 200)
+    moving = np.zeros((FRAMES, *moving_objects.shape(KINECT)), dtype=bool)
+    moving[:, :3, :3] = True
+    drift = judged(room()[1], n_inliers=weak, moving=moving).drift
+    assert (
+        drift.max() == pytest.approx(np.sqrt(15) * pose_doubt.STEP_WORST, rel=0.1) and (judged(room()[1], n_inliers=weak).drift == 0).all()
+    )
