@@ -15,8 +15,9 @@ from slamcli.navigation.planner import Route
 from slamcli.report.template import thousands
 from slamcli.runs import placement
 from slamcli.runs.run_directory import RunDir
-from slamcli.schema import Features, Grid
-from slamcli.visualization import grid_picture, render
+from slamcli.schema import Features, Grid, Moving
+from slamcli.stages import moving_parts
+from slamcli.visualization import grid_picture, moving_tint, render
 
 VIEW = render.View(width=1200, height=800)
 MOST_POINTS = 3_000_000  # of a cloud that is drawn
@@ -45,13 +46,15 @@ def draw(run: RunDir, content: Content) -> list[Picture]:
         ("octree", "Octree", _octree),
         ("grid2d", "Navigation grid", _grid),
         ("extract", "A frame and its features", _frame),
+        ("loop", "What moves", _moving),
     )
     found = []
     for stage, title, painter in painters:
         if run.record(stage) is None:
             continue
         try:
-            found.append(painter(run, title, path))
+            picture = painter(run, title, path)
+            found += [] if picture is None else [picture]
         except SlamError as error:
             found.append(Picture(title, f"Not drawn: {error}", ""))
     return found
@@ -120,6 +123,18 @@ def _frame(run: RunDir, title: str, path: np.ndarray) -> Picture:
     return Picture(
         title, f"frame {i}: {counts[i]} features, green with depth, red without; the circle grows with the pyramid level", _jpeg(image)
     )
+
+
+def _moving(run: RunDir, title: str, path: np.ndarray) -> Picture | None:
+    """Draw the frame in which most moves; nothing where nothing does."""
+    moving = run.load(Moving, "loop")
+    if not moving.moving.any():
+        return None
+    share, dataset = moving.moving.mean(axis=(1, 2)), run.dataset()
+    i = int(share.argmax())
+    image = moving_tint.tinted(dataset.rgb(i), moving, i, dataset.camera)
+    said = f"frame {i}: what is tinted moves, {share[i]:.0%} of the view; no pose rests on it and no map shows it"
+    return Picture(title, f"{said}; in {int((share > moving_parts.MOVES).sum())} of {len(share)} frames something moves", _jpeg(image))
 
 
 def example_route(grid: Grid, path: np.ndarray) -> Route | None:

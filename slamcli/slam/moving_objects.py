@@ -213,9 +213,12 @@ def hide_coarse(images: CoarseImages, moving: np.ndarray, camera: Camera) -> Coa
 
 def hide_pixels(depth: np.ndarray, mask: np.ndarray, camera: Camera) -> np.ndarray:
     """Remove what moves from a depth image (H, W) [m]; mask : (v, u) bool."""
-    return np.where(
-        np.append(with_margin(mask, MAP_MARGIN).ravel(), False)[_lookup(camera, _side(camera), mask.shape)], np.float32(np.nan), depth
-    )
+    return np.where(in_image(with_margin(mask, MAP_MARGIN), camera), np.float32(np.nan), depth)
+
+
+def in_image(mask: np.ndarray, camera: Camera) -> np.ndarray:
+    """Spread a mask (v, u) over the raw pixels (H, W) of an image."""
+    return np.append(mask.ravel(), False)[_lookup(camera, _side(camera), mask.shape)]
 
 
 def retold(moving: np.ndarray, own: Camera, common: Camera) -> np.ndarray:

@@ -18,11 +18,13 @@ from slamcli.formats import cloud, octomap
 from slamcli.geometry import voxel
 from slamcli.geometry.octree import CENTRE, DEPTH
 from slamcli.runs.run_directory import RunDir
-from slamcli.schema import KEY_FRAME, Features, Grid
+from slamcli.schema import KEY_FRAME, Features, Grid, Moving
+from slamcli.visualization import moving_tint
 
 MOST_POINTS = 1_500_000  # of the cloud
 MOST_CELLS = 300_000  # of the octree
 JPEG_QUALITY = 75
+MASKED_BY = ("track", "loop")  # stages that say what moves
 OURS, TRUTH, LOOP, KEY, WITH_DEPTH, WITHOUT_DEPTH = (0, 114, 178), (130, 140, 150), (213, 94, 0), (30, 30, 30), (60, 220, 60), (235, 60, 40)
 GRID_COLOURS = np.array([[255, 255, 255], [26, 26, 26], [200, 200, 200]], dtype=np.uint8)  # by state: free, occupied, unknown (-1)
 
@@ -150,6 +152,7 @@ def _log_frames(rr: Any, recording: Any, run: RunDir, content: Content, images: 
     pinhole = rr.Pinhole(image_from_camera=camera.K, resolution=[camera.width, camera.height], image_plane_distance=0.3)
     recording.log("world/camera/image", pinhole, static=True)
     dataset = _dataset(run) if images > 0 else None
+    moving = run.load(Moving, content.stage) if content.stage in MASKED_BY else Moving()
     step = max(1, -(-n // images)) if images > 0 else n
     error = np.full(n, np.nan)
     if ape := content.ape.get(content.stage):
@@ -167,7 +170,7 @@ def _log_frames(rr: Any, recording: Any, run: RunDir, content: Content, images: 
         if np.isfinite(error[i]):
             recording.log("curves/error", rr.Scalars(float(error[i])))
         if dataset is not None and i % step == 0:
-            _log_image(rr, recording, dataset, features, i)
+            _log_image(rr, recording, dataset, features, moving, i)
 
 
 def _dataset(run: RunDir) -> Dataset | None:
@@ -177,9 +180,10 @@ def _dataset(run: RunDir) -> Dataset | None:
         return None
 
 
-def _log_image(rr: Any, recording: Any, dataset: Dataset, features: Features, i: int) -> None:
+def _log_image(rr: Any, recording: Any, dataset: Dataset, features: Features, moving: Moving, i: int) -> None:
+    """Log an image with its features, what moves in it tinted."""
     try:
-        image = cv2.cvtColor(dataset.rgb(i), cv2.COLOR_RGB2BGR)
+        image = cv2.cvtColor(moving_tint.tinted(dataset.rgb(i), moving, i, dataset.camera), cv2.COLOR_RGB2BGR)
     except BadFrame:
         return
     _, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
