@@ -30,10 +30,10 @@ DISAGREEMENT = 0.03  # [m]
 DOUBTFUL_SIGMA = 0.03  # [m]
 MOVING = 0.6  # share of a view
 # [m] by which the motion from one frame to the next errs over the number of landmarks, at best, where few hold it, where no static world shows
-STEP_LANDMARK_SIGMA, STEP_BEST, STEP_WORST, STEP_BLIND = 0.15, 0.001, 0.004, 0.02
+STEP_LANDMARK_SIGMA, STEP_BEST, STEP_WORST, STEP_BLIND = 0.2, 0.001, 0.005, 0.02
 TIED = 30  # landmarks that two key frames share, so that nothing that happened between them tears them apart
 TIE_SIGMA = 0.003  # [m] of their relative pose
-DOUBTFUL_DRIFT = 0.03  # [m]
+DOUBTFUL_DRIFT = 0.028  # [m]
 
 
 def judge(views: Views, moving: np.ndarray, first: tuple[Tracks, Map], final: tuple[Tracks, Map]) -> Doubt:
