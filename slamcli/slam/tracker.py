@@ -87,7 +87,9 @@ class Tracker:
             landmark = self._lose(i, frame)
         else:
             landmark, self._n_lost, self._segment = location.landmark, 0, self._poses.segment(i)
-            if self._wants_key_frame(i, frame, location):
+            if self._stays[i] and self._poses.has_pose(i - 1):
+                self._poses.stay(i)  # the last of a rest, located for the landmarks that the next frame is tracked by
+            elif self._wants_key_frame(i, frame, location):
                 landmark = self._add_key_frame(i, frame, self._poses.T_wc(i), landmark)
         self._previous.remember(frame, landmark)
 
@@ -105,8 +107,6 @@ class Tracker:
         return self._poses.lost_reason
 
     def _wants_key_frame(self, i: int, frame: FrameFeatures, location: Location) -> bool:
-        if self._stays[i] and self._poses.has_pose(i - 1):
-            return False
         if location.placement is not None:
             return self._leaves_reference_by_depth(i, location.placement)
         return key_frames.wants_key_frame(self._sighting(i, frame, location.landmark), self._settings)
