@@ -11,6 +11,7 @@ import logging
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
@@ -72,10 +73,15 @@ def run(
     settings = settings if isinstance(settings, Mapping) else tuple(settings)
     resolve = partial(toml.resolve, name_or_file=config, settings=settings)
     targets = [str(target)] if isinstance(target, (str, os.PathLike)) else [str(one) for one in target]
-    opened, dataset, resolved = create_run(targets, resolve=resolve, path=path, data=data, progress=progress)
+    reopen = partial(create_run, targets, path=path, data=data, progress=progress)
+    opened, dataset, resolved = reopen(resolve=resolve)
     found: dict[str, Sequence[Finding]] = {}
     if look is not None and (force or start == NAMES[0] or not pipeline(opened, resolved, dataset=dataset).states()[NAMES[0]].is_fresh):
         found = {str(one.root.resolve()): look(one) for one in getattr(dataset, "parts", [dataset])}
+        said = [finding.name for findings in found.values() for finding in findings]
+        if resolved.recording.find_depth_camera and len(targets) == 1 and "registration" in said:
+            ((root, findings),) = found.items()
+            opened, dataset, resolved, found[root] = _registered(opened, dataset, resolved, findings, reopen)
     which: dict[str, Any] = {"start": start, "until": until, "force": force}
     _bring_up_to_date(opened, resolved, dataset, looked=found, progress=progress, tell=tell, **which)
     return Run(opened)
@@ -274,6 +280,24 @@ class Run:
         target = Path(path) if path is not None else self.path / "report.html"
         report.make(self.directory, target)
         return target
+
+
+def _registered(
+    opened: RunDir, dataset: "Dataset", config: Config, found: "Sequence[Finding]", reopen: "Callable[..., tuple[RunDir, Dataset, Config]]"
+) -> "tuple[RunDir, Dataset, Config, Sequence[Finding]]":
+    """Register depth that a look found not to lie on colour, where its camera shows beyond doubt, and say so; else all is as it was."""
+    from slamcli.inspection import depth_camera
+    from slamcli.slam.doubt import Finding
+
+    camera = depth_camera.find(dataset) if dataset.depth_camera is None else None
+    if camera is None or not camera.is_sure:
+        return opened, dataset, config, found
+    registered = replace(config, recording=replace(config.recording, depth_camera=camera.option))
+    opened, dataset, _ = reopen(resolve=lambda config: registered)
+    told = f"{camera.told}; -s recording.find_depth_camera=false leaves depth as it is"
+    log.warning("%s: %s", dataset.root, told)
+    others = [finding for finding in found if finding.name != "registration"]
+    return opened, dataset, registered, [*others, Finding("depth_camera", told)]
 
 
 def create_run(

@@ -16,6 +16,7 @@ from slamcli.datasets.recorded import Recorded
 from slamcli.datasets.recording import Recording, spread
 from slamcli.datasets.sources import ImageFiles, Images, count_missing, depth_pixels, picture
 from slamcli.errors import BadFrame, SlamError
+from slamcli.geometry import se3
 from slamcli.geometry.camera import SHAPE_TOLERANCE, Camera
 from slamcli.geometry.depth_registration import Registration
 
@@ -50,7 +51,7 @@ def assemble(found: Recorded, *, name: str, camera: dict[str, Any] | None = None
     size = size or (whole.width, whole.height)
     reduction = 1 if options.full_size else reduction_of(*size)
     working = whole.scaled(size[0] // reduction, size[1] // reduction) if reduction > 1 else whole
-    registration, said = _registration(found.calibration, working, whole, probe, found)
+    registration, said = _registration(found.calibration, working, whole, probe, found, options.depth_camera)
     warnings = [*found.warnings, *found.calibration.warnings, *pairs.warnings, *missing, *scale_said, *said]
     if reduction > 1:
         warnings.append(
@@ -167,11 +168,13 @@ def _depth_scale(found: Recorded, probe: _Probe, override: dict[str, Any] | None
 
 
 def _registration(
-    calibration: Calibration, working: Camera, whole: Camera, probe: _Probe, found: Recorded
+    calibration: Calibration, working: Camera, whole: Camera, probe: _Probe, found: Recorded, named: str
 ) -> tuple[Registration | None, list[str]]:
     """Say how depth comes to colour: as it is or resized (None), or registered from a camera of its own."""
     if probe.size is None:
         return None, []
+    if named:
+        return _named_depth_camera(named, working, probe.size, found.root)
     if calibration.depth_values:
         source = f"{calibration.source or found.root}: depth"
         values = {"width": probe.size[0], "height": probe.size[1], **calibration.depth_values, "depth_scale": working.depth_scale}
@@ -189,6 +192,22 @@ def _registration(
             "[depth] of camera.toml: fx fy cx cy and T_cd"
         )
     return None, []
+
+
+def _named_depth_camera(named: str, working: Camera, size: tuple[int, int], root: Path) -> tuple[Registration, list[str]]:
+    """Make the registration of `recording.depth_camera`."""
+    try:
+        fx, fy, cx, cy, *place = (float(word) for word in named.split())
+        x, y, z, *turn = place
+        rx, ry, rz = turn
+    except ValueError:
+        raise SlamError(f"recording.depth_camera = {named!r}: expected ten numbers, fx fy cx cy x y z rx ry rz [px, m, rad]") from None
+    values = {"width": working.width, "height": working.height, "fx": fx, "fy": fy, "cx": cx, "cy": cy, "depth_scale": working.depth_scale}
+    camera = Camera.from_dict(values, source="recording.depth_camera")
+    T_cd = se3.exp(np.array([0.0, 0.0, 0.0, rx, ry, rz]))
+    T_cd[:3, 3] = x, y, z
+    said = f"{root}: depth is registered to colour on reading (focal length {fx:.1f} px, {1000 * float(np.hypot(np.hypot(x, y), z)):.0f} mm aside)"
+    return Registration(camera if (camera.width, camera.height) == size else camera.scaled(*size), working, T_cd), [said]
 
 
 def _doubts_about_depth(found: Recorded, camera: Camera, probe: _Probe) -> list[str]:

@@ -58,7 +58,7 @@ class Registration:
 
 
 @dataclass(frozen=True)
-class _Colours:
+class Colours:
     """Pictures as edges see them: how steep they are along x and y, and how they move. `C` pictures."""
 
     stamp: np.ndarray  # (C,) float64 [s]
@@ -68,17 +68,18 @@ class _Colours:
 
 
 @dataclass(frozen=True)
-class _Edges:
-    """Depth edges of one frame: pixels (N, 2) x y, and whether the jump is along y."""
+class Edges:
+    """Depth edges of one frame."""
 
     stamp: float
-    xy: np.ndarray
-    is_along_y: np.ndarray
+    xy: np.ndarray  # (N, 2) px
+    is_along_y: np.ndarray  # (N,) bool, whether the jump is along y
+    depth: np.ndarray  # (N,) float32 [m] of the nearer side
 
 
 def measure(dataset: Dataset, *, workers: int, blocks: int = BLOCKS) -> Registration:
     """Measure shift and lag of a recording's depth in so many stretches of consecutive frames."""
-    colours, edges = _collect(dataset, workers, blocks)
+    colours, edges = collect(dataset, workers, blocks)
     n_points = sum(len(e.xy) for e in edges)
     if n_points < LEAST_POINTS or len(colours.stamp) < 3:
         return Registration(None, None, n_points, None, 1.0, 1.0)
@@ -106,8 +107,8 @@ def measure(dataset: Dataset, *, workers: int, blocks: int = BLOCKS) -> Registra
     )
 
 
-def _collect(dataset: Dataset, workers: int, blocks: int) -> tuple[_Colours, list[_Edges]]:
-    """Read stretches of consecutive frames spread over the recording."""
+def collect(dataset: Dataset, workers: int, blocks: int) -> tuple[Colours, list[Edges]]:
+    """Read stretches of consecutive frames spread over the recording: their pictures' steepness and motion, and their depth edges."""
     n = len(dataset)
     starts = np.unique(np.linspace(0, max(n - BLOCK_FRAMES, 0), blocks).astype(int))
     wanted_depth = sorted({i for start in starts for i in range(start, min(start + BLOCK_FRAMES, n)) if dataset.depth_name[i]})
@@ -124,7 +125,7 @@ def _collect(dataset: Dataset, workers: int, blocks: int) -> tuple[_Colours, lis
     steepness = np.empty(size, dtype=np.uint8)
     for k, pair in enumerate(ordered_map(lambda i: _steepness(greys[i]), used, workers=workers)):
         steepness[0, k], steepness[1, k] = pair
-    colours = _Colours(np.array(dataset.stamp[used]), steepness, list(ordered_map(velocity_of, used, workers=workers)), reduction)
+    colours = Colours(np.array(dataset.stamp[used]), steepness, list(ordered_map(velocity_of, used, workers=workers)), reduction)
     rng = np.random.default_rng(0)
     depths = zip(wanted_depth, ordered_map(partial(_try, dataset.depth), wanted_depth, workers=workers), strict=True)
     return colours, [_depth_edges(depth, float(dataset.depth_stamp[i]), rng) for i, depth in depths if depth is not None]
@@ -152,15 +153,16 @@ def _velocity(grey: np.ndarray, following: np.ndarray, seconds: float, reduction
     return flow * np.float32(reduction / max(seconds, 1e-3))
 
 
-def _depth_edges(depth: np.ndarray, stamp: float, rng: np.random.Generator) -> _Edges:
+def _depth_edges(depth: np.ndarray, stamp: float, rng: np.random.Generator) -> Edges:
     """Find depth jumps along rows and columns, from both sides so that their offsets cancel."""
-    points, flags = [], []
+    points, flags, depths = [], [], []
     margin = LARGEST_SHIFT + 2
     height, width = depth.shape
     for along_x in (True, False):
         lines = depth[::LINE_STEP] if along_x else np.ascontiguousarray(depth[:, ::LINE_STEP].T)
         for sign in (1.0, -1.0):
-            row, column, half_gap = _jumps(lines if sign > 0 else lines[:, ::-1])
+            ahead = lines if sign > 0 else lines[:, ::-1]
+            row, column, half_gap = _jumps(ahead)
             across = sign * half_gap + (column if sign > 0 else lines.shape[1] - 1 - column)
             x, y = (across, LINE_STEP * row) if along_x else (LINE_STEP * row, across)
             inside = np.flatnonzero((x >= margin) & (x < width - margin) & (y >= margin) & (y < height - margin))
@@ -168,7 +170,8 @@ def _depth_edges(depth: np.ndarray, stamp: float, rng: np.random.Generator) -> _
                 inside = np.sort(rng.choice(inside, EDGE_POINTS, replace=False))
             points.append(np.stack([x[inside], y[inside]], axis=1))
             flags.append(np.full(len(inside), not along_x))
-    return _Edges(stamp, np.concatenate(points).astype(np.float32), np.concatenate(flags))
+            depths.append(ahead[row, column][inside])
+    return Edges(stamp, np.concatenate(points).astype(np.float32), np.concatenate(flags), np.concatenate(depths))
 
 
 def _jumps(lines: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -186,7 +189,7 @@ def _jumps(lines: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return row, at, np.minimum(0.5 * gap[row, at], LARGEST_LOSS)
 
 
-def _at_lag(colours: _Colours, edges: list[_Edges], lag: float) -> np.ndarray:
+def _at_lag(colours: Colours, edges: list[Edges], lag: float) -> np.ndarray:
     """Move every depth edge to the time of the picture nearest to its true time; give its place in that picture's steepness, (N,) int64."""
     _, n, height, width = colours.steepness.shape
     places = []
@@ -205,14 +208,14 @@ def _at_lag(colours: _Colours, edges: list[_Edges], lag: float) -> np.ndarray:
     return np.concatenate(places) if places else np.empty(0, dtype=np.int64)
 
 
-def _score(colours: _Colours, places: np.ndarray, dx: int, dy: int) -> float:
+def _score(colours: Colours, places: np.ndarray, dx: int, dy: int) -> float:
     """Return the mean steepness under the edges when moved by (dx, dy) [px]."""
     return float(colours.steepness.reshape(-1)[places + (dy * colours.steepness.shape[3] + dx)].mean()) if len(places) else 0.0
 
 
-def _first_guess(colours: _Colours, edges: list[_Edges]) -> float:
+def _first_guess(colours: Colours, edges: list[Edges]) -> float:
     """Find the lag near which the best shift is best, on a coarse lattice and a part of the points: far off, neither is found alone."""
-    few = [_Edges(e.stamp, e.xy[::THINNING], e.is_along_y[::THINNING]) for e in edges]
+    few = [Edges(e.stamp, e.xy[::THINNING], e.is_along_y[::THINNING], e.depth[::THINNING]) for e in edges]
     best = {}
     for lag in FIRST_LAGS:
         places = _at_lag(colours, few, lag)
@@ -220,7 +223,7 @@ def _first_guess(colours: _Colours, edges: list[_Edges]) -> float:
     return max(best, key=best.__getitem__)
 
 
-def _best_shift(colours: _Colours, edges: list[_Edges], lag: float) -> tuple[tuple[int, int], float]:
+def _best_shift(colours: Colours, edges: list[Edges], lag: float) -> tuple[tuple[int, int], float]:
     places = _at_lag(colours, edges, lag)
     coarse = {(dx, dy): _score(colours, places, dx, dy) for dx in _steps(3) for dy in _steps(3)}
     x, y = max(coarse, key=coarse.__getitem__)
@@ -229,7 +232,7 @@ def _best_shift(colours: _Colours, edges: list[_Edges], lag: float) -> tuple[tup
     return best, fine[best] / max(float(np.mean(list(coarse.values()))), 1e-9)
 
 
-def _magnification(dataset: Dataset, colours: _Colours, edges: list[_Edges]) -> float | None:
+def _magnification(dataset: Dataset, colours: Colours, edges: list[Edges]) -> float | None:
     """Find the magnification under which depth edges lie on the picture's, where that is clear and not 1."""
     height, width = colours.steepness.shape[2:]
     centre = np.array([dataset.camera.cx, dataset.camera.cy], dtype=np.float32)
@@ -239,7 +242,7 @@ def _magnification(dataset: Dataset, colours: _Colours, edges: list[_Edges]) -> 
         for e in edges:
             xy = centre + np.float32(factor) * (e.xy[::2] - centre)
             inside = ((xy > LARGEST_SHIFT) & (xy < np.array([width, height]) - 1 - LARGEST_SHIFT)).all(axis=1)
-            moved.append(_Edges(e.stamp, xy[inside], e.is_along_y[::2][inside]))
+            moved.append(Edges(e.stamp, xy[inside], e.is_along_y[::2][inside], e.depth[::2][inside]))
         places = _at_lag(colours, moved, 0.0)
         if len(places) >= LEAST_POINTS:
             scores = [_score(colours, places, dx, dy) for dx in _steps(3) for dy in _steps(3)]
@@ -251,7 +254,7 @@ def _magnification(dataset: Dataset, colours: _Colours, edges: list[_Edges]) -> 
     return float(best) if is_inside and is_clear and abs(best - 1.0) > NOT_ONE else None
 
 
-def _refine(colours: _Colours, edges: list[_Edges], shift: tuple[int, int], lag: float) -> tuple[tuple[int, int], float]:
+def _refine(colours: Colours, edges: list[Edges], shift: tuple[int, int], lag: float) -> tuple[tuple[int, int], float]:
     """Search both together nearby: while the picture moves one way, a shift passes for a lag, and one at a time they stop half-way."""
     found = {}
     for t in LAGS[np.abs(LAGS - lag) < 0.0301]:
@@ -266,10 +269,11 @@ def _refine(colours: _Colours, edges: list[_Edges], shift: tuple[int, int], lag:
     return max(found, key=found.__getitem__)
 
 
-def _best_plain(colours: _Colours, edges: list[_Edges]) -> tuple[float, tuple[int, int], float]:
+def _best_plain(colours: Colours, edges: list[Edges]) -> tuple[float, tuple[int, int], float]:
     """Find the score, shift and lag that fit best among those of a sound recording."""
     reach = max(1, round(PLAIN_SHIFT * colours.steepness.shape[3]))
-    near, found = range(-reach, reach + 1), {}
+    near = range(-reach, reach + 1)
+    found: dict[tuple[tuple[int, int], float], float] = {}
     for lag in np.arange(*PLAIN_LAG, LAGS[1] - LAGS[0]):
         places = _at_lag(colours, edges, float(lag))
         found |= {((dx, dy), float(lag)): _score(colours, places, dx, dy) for dx in near for dy in near}
@@ -277,7 +281,7 @@ def _best_plain(colours: _Colours, edges: list[_Edges]) -> tuple[float, tuple[in
     return found[shift, lag], shift, lag
 
 
-def _shift_contrast(colours: _Colours, edges: list[_Edges], score: float, lag: float) -> float:
+def _shift_contrast(colours: Colours, edges: list[Edges], score: float, lag: float) -> float:
     """Return the score of a shift over the mean of all shifts."""
     places = _at_lag(colours, edges, lag)
     return score / max(float(np.mean([_score(colours, places, dx, dy) for dx in _steps(3) for dy in _steps(3)])), 1e-9)
@@ -288,7 +292,7 @@ def _steps(step: int) -> range:
     return range(-reach, reach + 1, step)
 
 
-def _best_lag(colours: _Colours, edges: list[_Edges], shift: tuple[int, int]) -> tuple[float, float]:
+def _best_lag(colours: Colours, edges: list[Edges], shift: tuple[int, int]) -> tuple[float, float]:
     scores = np.array([_score(colours, _at_lag(colours, edges, lag), *shift) for lag in LAGS])
     scores = np.convolve(np.pad(scores, 1, mode="edge"), [0.25, 0.5, 0.25], mode="valid")
     best = int(scores.argmax())
