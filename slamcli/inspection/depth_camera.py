@@ -74,15 +74,13 @@ class DepthCamera:
         )
 
 
-def find(dataset: Dataset, *, magnification: float | None = None, workers: int = 2) -> DepthCamera | None:
-    """Find the depth camera of unregistered depth; None where there are too few edges.
-
-    magnification : by which depth must be enlarged to fit colour, roughly; None = unknown
-    """
+def find(dataset: Dataset, *, workers: int = 2) -> DepthCamera | None:
+    """Find the depth camera of unregistered depth; None where there are too few edges."""
     colours, edges = registration.collect(dataset, workers, registration.BLOCKS)
     if sum(len(e.xy) for e in edges) < registration.LEAST_POINTS:
         return None
     camera, overlay = dataset.camera, _Overlay(dataset, colours, edges, START_LAG)
+    magnification = registration.magnification_of(dataset, colours, edges)
     factors = (magnification,) if magnification is not None else STARTS
     starts = [np.array([np.log(camera.fx / factor), 0.0, 0.0, 0.0, 0.0, 0.0]) for factor in factors]
     rough = max((_solve(overlay, start, BLUR[:2]) for start in starts), key=overlay.contrast)

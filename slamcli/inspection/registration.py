@@ -99,7 +99,7 @@ def measure(dataset: Dataset, *, workers: int, blocks: int = BLOCKS) -> Registra
         shift=(float(shift[0]), float(shift[1])) if is_shift_sure else None,
         lag=round(lag, 4) if is_shift_sure and is_lag_sure else None,
         n_points=n_points,
-        magnification=_magnification(dataset, colours, edges)
+        magnification=magnification_of(dataset, colours, edges)
         if shift_contrast < SURE_CONTRAST or max(map(abs, shift)) > SMALL_SHIFT
         else None,
         shift_contrast=shift_contrast,
@@ -232,7 +232,7 @@ def _best_shift(colours: Colours, edges: list[Edges], lag: float) -> tuple[tuple
     return best, fine[best] / max(float(np.mean(list(coarse.values()))), 1e-9)
 
 
-def _magnification(dataset: Dataset, colours: Colours, edges: list[Edges]) -> float | None:
+def magnification_of(dataset: Dataset, colours: Colours, edges: list[Edges]) -> float | None:
     """Find the magnification under which depth edges lie on the picture's, where that is clear and not 1."""
     height, width = colours.steepness.shape[2:]
     centre = np.array([dataset.camera.cx, dataset.camera.cy], dtype=np.float32)
