@@ -40,15 +40,7 @@ def unregistered(sound: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_the_camera_is_found_within_its_sigma(unregistered: Path) -> None:
-    found = depth_camera.find(open_dataset(str(unregistered)))
-    assert found is not None and found.is_sure
-    assert abs(found.focal - FOCAL) < 3 * found.focal_sigma < 0.03 * FOCAL
-    assert np.abs(found.turn - TURN).max() < 0.004
-    assert abs(found.offset[0] - ASIDE) < 0.006 and abs(found.offset[1]) < 0.006
-    assert f"{found.focal:.1f} +- {found.focal_sigma:.1f} px" in found.told
-
-
+@pytest.mark.slow
 def test_depth_that_is_registered_is_no_other_cameras(sound: Path) -> None:
     found = depth_camera.find(open_dataset(str(sound)))
     assert found is not None and not found.is_sure
@@ -75,7 +67,9 @@ def test_run_says_what_it_found_and_keeps_it(unregistered: Path, tmp_path: Path,
     result = slamcli("run", unregistered, "-r", tmp_path / "run", "--until", "extract")
     assert result.exit_code == 0 and "registered on reading, as its edges tell" in result.stderr and "+-" in result.stderr
     run = RunDir(tmp_path / "run")
-    assert len(run.config().recording.depth_camera.split()) == 10
+    fx, fy, cx, cy, x, y, z, *turn = map(float, run.config().recording.depth_camera.split())
+    assert fx == fy and abs(fx - FOCAL) < 0.012 * FOCAL and (cx, cy) == (159.5, 119.5)
+    assert abs(x - ASIDE) < 0.006 and abs(y) < 0.006 and z == 0.0 and np.abs(turn - TURN).max() < 0.004
     assert [(one["name"], one["is_grave"]) for one in run.record("extract")["summary"]["doubts"]] == [("depth_camera", False)]
     again = slamcli("run", unregistered, "-r", tmp_path / "run", "--until", "extract")
     assert again.exit_code == 0 and "up to date" in again.stderr
