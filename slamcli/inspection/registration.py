@@ -36,9 +36,6 @@ SMALL_SHIFT = 3  # px
 BETTER = 1.2  # times the contrast at 1 that another magnification needs,
 STEEPER = 1.05  # times the steepness under the edges at 1, likewise: fewer edges near the centre have more contrast by themselves,
 NOT_ONE = 0.04  # and how far from 1 it must be
-PLAIN_SHIFT = 3 / 640  # of the picture's width, at least a pixel, and
-PLAIN_LAG = (-0.02, 0.0351)  # [s] of a sound recording; the stamps of the first Kinect's depth are about 0.02 s late
-PLAINLY_BETTER = 1.05  # times the steepness within these that any other shift and lag need: while the picture moves evenly, many fit
 LEAST_LAG_CONTRAST = 1.08  # of the best lag over lags 0.05 s away: below, there was too little motion to tell
 LARGEST_FLOW_SIDE = 320  # px; optical flow is computed on pictures reduced to this width
 
@@ -87,13 +84,8 @@ def measure(dataset: Dataset, *, workers: int, blocks: int = BLOCKS) -> Registra
     shift, _ = _best_shift(colours, edges, lag)
     lag, _ = _best_lag(colours, edges, shift)
     shift, lag = _refine(colours, edges, shift, lag)
-    plain_score, plain_shift, plain_lag = _best_plain(colours, edges)
-    if PLAINLY_BETTER * plain_score > _score(colours, _at_lag(colours, edges, lag), *shift):
-        shift, lag = plain_shift, plain_lag
-        shift_contrast, lag_contrast = _shift_contrast(colours, edges, plain_score, lag), _best_lag(colours, edges, shift)[1]
-    else:
-        lag, lag_contrast = _best_lag(colours, edges, shift)
-        shift, shift_contrast = _best_shift(colours, edges, lag)
+    lag, lag_contrast = _best_lag(colours, edges, shift)
+    shift, shift_contrast = _best_shift(colours, edges, lag)
     is_shift_sure, is_lag_sure = shift_contrast >= LEAST_CONTRAST, lag_contrast >= LEAST_LAG_CONTRAST
     return Registration(
         shift=(float(shift[0]), float(shift[1])) if is_shift_sure else None,
@@ -267,24 +259,6 @@ def _refine(colours: Colours, edges: list[Edges], shift: tuple[int, int], lag: f
                 )
                 found[moved, float(t)] = _score(colours, places, *moved)
     return max(found, key=found.__getitem__)
-
-
-def _best_plain(colours: Colours, edges: list[Edges]) -> tuple[float, tuple[int, int], float]:
-    """Find the score, shift and lag that fit best among those of a sound recording."""
-    reach = max(1, round(PLAIN_SHIFT * colours.steepness.shape[3]))
-    near = range(-reach, reach + 1)
-    found: dict[tuple[tuple[int, int], float], float] = {}
-    for lag in np.arange(*PLAIN_LAG, LAGS[1] - LAGS[0]):
-        places = _at_lag(colours, edges, float(lag))
-        found |= {((dx, dy), float(lag)): _score(colours, places, dx, dy) for dx in near for dy in near}
-    shift, lag = max(found, key=found.__getitem__)
-    return found[shift, lag], shift, lag
-
-
-def _shift_contrast(colours: Colours, edges: list[Edges], score: float, lag: float) -> float:
-    """Return the score of a shift over the mean of all shifts."""
-    places = _at_lag(colours, edges, lag)
-    return score / max(float(np.mean([_score(colours, places, dx, dy) for dx in _steps(3) for dy in _steps(3)])), 1e-9)
 
 
 def _steps(step: int) -> range:
