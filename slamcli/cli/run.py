@@ -63,6 +63,10 @@ def run_command(
     from slamcli import api, console
 
     named = run or os.environ.get("SLAMCLI_RUN")
+    if len(targets) > 1 and not named:
+        raise click.UsageError(
+            "several recordings make one map, whose run needs a name, such as -r runs/house; for a run of each: slamcli batch RECORDING..."
+        )
     assignments = (*(f"{name}={json.dumps(value)}" for name, value in selection.items()), *assignments)
     options: dict[str, Any] = {"settings": assignments, "config": config_name, "start": start, "until": until, "force": force}
     options |= {"progress": console.progress, "tell": console.say}

@@ -41,7 +41,7 @@ class RecordingConfig:
     fps: float = option(0.0, "frame rate of a recording without stamps; 0 = 30 [Hz]", ge=0, le=1000)
     known_camera: str = option("", 'known camera whose nominal intrinsics are used, such as "d435"; "" = the recording\'s own')
     find_depth_camera: bool = option(True, "where depth is plainly not registered, find its camera and register it")
-    depth_camera: str = option("", 'camera of unregistered depth, at the pictures\' size: "fx fy cx cy x y z rx ry rz" [px, m, rad]')
+    depth_camera: str = option("", 'depth camera, "fx fy cx cy x y z rx ry rz" [px, m, rad]')
     full_size: bool = option(False, "use pictures of more than a megapixel at full size, not at about 640 px")
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from slamcli import artifacts, files
+from slamcli import artifacts
 from slamcli.config.options import Config, ExtractConfig
 from slamcli.datasets import Dataset, depth_unit
 from slamcli.datasets.recording import spread
@@ -19,6 +19,7 @@ from slamcli.schema import CoarseDepth, Features, Flow
 from slamcli.slam import doubt, stream_doubt
 from slamcli.slam.doubt import Finding
 from slamcli.slam.stream_doubt import Readings
+from slamcli.stages.association_file import write_association
 from slamcli.stages.camera_file import write_camera
 from slamcli.stages.contract import Inputs, Summary, Tools
 from slamcli.vision import optical_flow, orb
@@ -177,11 +178,3 @@ def _flow_table(dataset: Dataset, camera: Camera, found: list[Frame], tools: Too
     is_found = np.isfinite(raw[:, 0])
     raw[is_found] = camera.undistort(raw[is_found])
     return Flow(flow_xy=raw)
-
-
-def write_association(path: Path, dataset: Dataset, depth_stamp: np.ndarray) -> None:
-    """Write which depth image goes with which colour image, in the format of the TUM tools: stamp, path, stamp, path."""
-    lines = ["# colour stamp [s], colour image, depth stamp [s], depth image; commented out: no usable depth image"]
-    for stamp, colour, with_depth, depth in zip(dataset.stamp, dataset.colour_name, depth_stamp, dataset.depth_name, strict=True):
-        lines.append(f"{stamp:.6f} {colour} {with_depth:.6f} {depth}" if np.isfinite(with_depth) else f"# {stamp:.6f} {colour}")
-    files.write_text(path, "\n".join(lines) + "\n")

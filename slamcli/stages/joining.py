@@ -41,9 +41,9 @@ from slamcli.schema import (
 )
 from slamcli.slam import doubt, map_segments, moving_objects
 from slamcli.slam.doubt import Finding
+from slamcli.stages.association_file import write_association
 from slamcli.stages.camera_file import write_camera
 from slamcli.stages.contract import Inputs, Stored, Summary, Tools
-from slamcli.stages.extract import write_association
 from slamcli.stages.map_outputs import save_map
 from slamcli.stages.moving_parts import coarse_images
 from slamcli.stages.of_several import NAMES_FILE

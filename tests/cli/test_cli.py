@@ -158,7 +158,7 @@ def test_what_the_user_can_mend_is_one_line_and_status_1(fake: Path, slamcli: Sl
         (["statsu"], "Did you mean 'status'?"),
         (["run", "a", "--unti", "track"], "--until"),
         (["run", "a", "--until", "trak"], "'track'"),
-        (["run", "a", "b"], "unexpected extra argument"),
+        (["run", "a", "b"], "needs a name, such as -r runs/house"),
     ],
 )
 def test_usage_errors_are_status_2_and_suggest(slamcli: Slamcli, arguments: list[str], message: str) -> None:

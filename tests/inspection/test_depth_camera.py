@@ -46,6 +46,7 @@ def test_depth_that_is_registered_is_no_other_cameras(sound: Path) -> None:
     assert found is not None and not found.is_sure
 
 
+@pytest.mark.shows("recording.depth_camera")
 def test_the_option_registers_depth(unregistered: Path, sound: Path) -> None:
     option = f"{FOCAL} {FOCAL} 159.5 119.5 {ASIDE} 0 0 {' '.join(map(str, TURN))}"
     dataset, true = open_dataset(str(unregistered), options=RecordingConfig(depth_camera=option)), open_dataset(str(sound))
@@ -75,6 +76,7 @@ def test_run_says_what_it_found_and_keeps_it(unregistered: Path, tmp_path: Path,
     assert again.exit_code == 0 and "up to date" in again.stderr
 
 
+@pytest.mark.shows("recording.find_depth_camera")
 def test_it_can_be_switched_off(unregistered: Path, tmp_path: Path, slamcli: Callable[..., Result]) -> None:
     result = slamcli("run", unregistered, "-r", tmp_path / "run", "--until", "extract", "-s", "recording.find_depth_camera=false")
     assert result.exit_code == 0

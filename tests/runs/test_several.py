@@ -222,7 +222,6 @@ def test_mistakes_are_told(recordings: dict[str, Path], grown: RunDir, here: Pat
     room, again, elsewhere = recordings.values()
     shutil.copytree(room, here / "copy")
     for arguments, message in (
-        (["run", room, again], "needs a name, such as -r runs/house; for a run of each: slamcli batch"),
         (["run", room, here / "copy", "-r", here / "h"], "the same recording as"),
         (["run", room, elsewhere, "-r", grown.path], "holds a run of other recordings"),
         (["run", room, "-r", grown.path], "or add to that map with: slamcli add"),
