@@ -4,7 +4,7 @@
     python scripts/floor_plans.py OUT [--seeds 11 12 13 14 15] [--frames 240]
 
 For each seed a room is rendered, mapped and drawn. A room has four walls: each is compared with the wall of the plan nearest in length
-among those whose direction fits, and each corner with a right angle. OUT keeps recordings and runs; what is there is used again.
+among those whose direction fits and whose ends are corners, and each corner with a right angle. OUT keeps recordings and runs; what is there is used again.
 """
 
 import argparse
@@ -48,7 +48,8 @@ def main() -> None:
 
 def compared(walls: list[Wall], sides: np.ndarray) -> tuple[list[float], list[float]]:
     """Return by how much the lengths of the room's walls are off [m], and the angles between neighbours from right ones [degrees]."""
-    long = [wall for wall in walls if wall.length > LEAST * sides.min()]
+    corners = [end for wall in walls for end in (wall.start, wall.end)]
+    long = [wall for wall in walls if wall.length > LEAST * sides.min() and is_whole(wall, corners)]
     if not long:
         return [], []
     along = np.array([wall.end - wall.start for wall in long])
@@ -61,6 +62,11 @@ def compared(walls: list[Wall], sides: np.ndarray) -> tuple[list[float], list[fl
         found += off[:2]
     turned = [abs((value - first + 45.0) % 90.0 - 45.0) for value in angle if value != first]
     return found, turned
+
+
+def is_whole(wall: Wall, ends: list[np.ndarray]) -> bool:
+    """Say whether a wall ends in corners with others: of one that was seen in part the length is not told."""
+    return all(sum(bool(np.linalg.norm(end - other) < 1e-6) for other in ends) > 1 for end in (wall.start, wall.end))
 
 
 if __name__ == "__main__":

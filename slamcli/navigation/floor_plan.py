@@ -1,12 +1,13 @@
 """A floor plan: walls as straight lines, rooms with their areas, and the doors between them."""
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from slamcli.navigation.rooms import Rooms, find_rooms
-from slamcli.navigation.walls import Wall, find_walls
+from slamcli.navigation.walls import Wall, find_walls, joined_behind_furniture
 from slamcli.schema import Grid
 
 
@@ -43,8 +44,15 @@ def make_floor_plan(
     xyz, normal : (N, 3) of the cloud [m], level frame; wall_height : m that walls reach up to at least
     door_width : m, of the widest door; least_area : m^2, of the smallest room
     """
-    walls = find_walls(xyz, normal, least_height=wall_height)
+    walls = joined_behind_furniture(find_walls(xyz, normal, least_height=wall_height), partial(_is_free, grid))
     return FloorPlan(walls, find_rooms(grid, walls, door_width=door_width, least_area=least_area))
+
+
+def _is_free(grid: Grid, places: np.ndarray) -> np.ndarray:
+    column, row = np.floor((places - grid.origin) / float(grid.resolution)).astype(np.int64).T
+    height, width = grid.state.shape
+    is_in = (row >= 0) & (row < height) & (column >= 0) & (column < width)
+    return is_in & (grid.state[row.clip(0, height - 1), column.clip(0, width - 1)] == 0)
 
 
 def _rounded(values: np.ndarray) -> Any:

@@ -4,6 +4,7 @@ Every point votes with its own normal for the line that it would lie on (a Hough
 CACM 1972, doi:10.1145/361237.361242); the lines with the most votes are fitted to their points and cut where the wall is interrupted.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,7 +22,10 @@ GAP = 0.5  # [m] an interruption from which on it is two walls
 LEAST_LENGTH = 0.6  # [m]
 LEAST_FILL = 0.5  # share of a wall's area, from its lowest to its highest point, that shows points
 FILL_CELL = 0.1  # [m] of that area's raster
+ONE_LINE, ONE_LINE_COSINE = 0.06, 0.9986  # [m] apart, and cosine of the turn, of two pieces of one wall at most
+SAMPLED = 0.025  # [m] step in which the gap between them is looked at
 CORNER = 0.5  # [m] from the ends of two walls to where their lines meet, at most, for a corner
+HIDDEN_CORNER = 2.5  # [m] likewise, where no free floor was seen on the way: furniture hides the ends
 CORNER_SINE = 0.5  # of the angle between them
 
 
@@ -126,23 +130,64 @@ def _cut(points: np.ndarray, n: np.ndarray, rho: float, least_height: float) -> 
     return walls
 
 
-def _joined(walls: list[Wall]) -> list[Wall]:
-    """Move the ends of walls to the corners where two of them meet."""
+def joined_behind_furniture(walls: list[Wall], is_free: Callable[[np.ndarray], np.ndarray]) -> list[Wall]:
+    """Join pieces of one wall between which no free floor was seen: furniture stands there, no door.
+
+    is_free : says which of places (N, 2) [m] are known to be free floor
+    """
+    left, done = sorted(walls, key=lambda wall: -wall.length), []
+    while left:
+        wall = left.pop(0)
+        while (other := next((one for one in left if _go_on(wall, one) and not _is_open(wall, one, is_free)), None)) is not None:
+            left.remove(other)
+            along = np.array([-wall.normal[1], wall.normal[0]])
+            ends = sorted((wall.start, wall.end, other.start, other.end), key=lambda end: float(end @ along))
+            wall = replace(wall, start=ends[0], end=ends[-1], top=max(wall.top, other.top))
+        done.append(wall)
+    return _joined(done, is_free)
+
+
+def _go_on(a: Wall, b: Wall) -> bool:
+    """Say whether two walls lie on one line, with the same side seen."""
+    off = np.abs([(end - a.start) @ a.normal for end in (b.start, b.end)])
+    return bool(a.normal @ b.normal > ONE_LINE_COSINE and off.max() < ONE_LINE)
+
+
+def _is_open(a: Wall, b: Wall, is_free: Callable[[np.ndarray], np.ndarray]) -> bool:
+    """Say whether free floor was seen on the line between two pieces of wall, as wide as a door."""
+    pairs = [(p, q) for p in (a.start, a.end) for q in (b.start, b.end)]
+    return _has_door(*min(pairs, key=lambda pair: float(np.linalg.norm(pair[1] - pair[0]))), is_free)
+
+
+def _has_door(start: np.ndarray, end: np.ndarray, is_free: Callable[[np.ndarray], np.ndarray]) -> bool:
+    n = int(np.ceil(np.linalg.norm(end - start) / SAMPLED)) + 1
+    free = is_free(start + np.linspace(0.0, 1.0, n)[:, None] * (end - start))
+    runs = np.diff(np.flatnonzero(np.concatenate([[True], ~free, [True]])))
+    return bool((runs.max(initial=1) - 1) * SAMPLED >= GAP)
+
+
+def _joined(walls: list[Wall], is_free: Callable[[np.ndarray], np.ndarray] | None = None) -> list[Wall]:
+    """Move the ends of walls to the corners where two of them meet; with `is_free`, also to those that furniture hides."""
     ends = [[wall.start, wall.end] for wall in walls]
     for k, wall in enumerate(walls):
         for e, end in enumerate((wall.start, wall.end)):
-            corners = [corner for other in walls if other is not wall and (corner := _corner(wall, other)) is not None]
-            near = [corner for corner in corners if np.linalg.norm(corner - end) < CORNER]
+            corners = [corner for other in walls if other is not wall and (corner := _corner(wall, other, is_free)) is not None]
+            other_end, reach = wall.end if e == 0 else wall.start, CORNER if is_free is None else HIDDEN_CORNER
+            near = [corner for corner in corners if np.linalg.norm(corner - end) < min(reach, float(np.linalg.norm(corner - other_end)))]
             if near:
                 ends[k][e] = min(near, key=lambda corner: float(np.linalg.norm(corner - end)))
     return [replace(wall, start=start, end=end) for wall, (start, end) in zip(walls, ends, strict=True)]
 
 
-def _corner(a: Wall, b: Wall) -> np.ndarray | None:
-    """Find where the lines of two walls meet; None where they hardly do, or far from an end of either."""
+def _corner(a: Wall, b: Wall, is_free: Callable[[np.ndarray], np.ndarray] | None) -> np.ndarray | None:
+    """Find where the lines of two walls meet; None where they hardly do, far from an end of either, or beyond free floor."""
     normals = np.stack([a.normal, b.normal])
     if abs(np.linalg.det(normals)) < CORNER_SINE:
         return None
     corner = np.linalg.solve(normals, np.array([a.normal @ a.start, b.normal @ b.start]))
-    is_near = [min(np.linalg.norm(corner - wall.start), np.linalg.norm(corner - wall.end)) < CORNER for wall in (a, b)]
-    return corner if all(is_near) else None
+    for wall in (a, b):
+        end = min((wall.start, wall.end), key=lambda end: float(np.linalg.norm(corner - end)))
+        apart = np.linalg.norm(corner - end)
+        if apart >= CORNER and (is_free is None or apart >= HIDDEN_CORNER or _has_door(end, corner, is_free)):
+            return None
+    return corner

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from slamcli.navigation.walls import Wall, find_walls
+from slamcli.navigation.walls import Wall, find_walls, joined_behind_furniture
 
 NOISE = 0.008  # [m]
 
@@ -89,3 +89,31 @@ def test_a_cloud_without_walls_has_none() -> None:
     floor = np.column_stack([np.random.default_rng(0).uniform(0, 4, (5000, 2)), np.zeros(5000)])
     assert find_walls(floor, np.tile([0.0, 0.0, 1.0], (5000, 1)), least_height=1.2) == []
     assert find_walls(np.zeros((0, 3)), np.zeros((0, 3)), least_height=1.2) == []
+
+
+def test_pieces_of_a_wall_are_one_behind_furniture_and_two_beside_a_door() -> None:
+    pieces = find_walls(
+        *cloud(face([0, 0], [2.0, 0]), face([3.5, 0], [5.0, 0], seed=1), face([5.0, 0], [5.0, 3.0], seed=2)), least_height=1.2
+    )
+    assert len(pieces) == 3
+    hidden = joined_behind_furniture(pieces, lambda places: np.zeros(len(places), bool))
+    assert sorted(wall.length for wall in hidden) == pytest.approx([3.0, 5.0], abs=0.03)
+    door = joined_behind_furniture(pieces, lambda places: (places[:, 0] > 2.3) & (places[:, 0] < 3.2))
+    assert sorted(wall.length for wall in door) == pytest.approx([1.5, 2.0, 3.0], abs=0.03)
+    slit = joined_behind_furniture(pieces, lambda places: (places[:, 0] > 2.3) & (places[:, 0] < 2.5))
+    assert len(slit) == 2, "free floor narrower than any door is a gap in the furniture"
+
+
+def test_walls_on_parallel_lines_and_the_two_faces_of_one_stay_apart() -> None:
+    walls = find_walls(
+        *cloud(face([0, 0], [2.0, 0]), face([2.6, 0.2], [5.0, 0.2], seed=1), face([4.0, -0.02], [2.4, -0.02], seed=2)), least_height=1.2
+    )
+    assert len(joined_behind_furniture(walls, lambda places: np.zeros(len(places), bool))) == len(walls) == 3
+
+
+def test_a_corner_behind_furniture_is_found_and_none_beyond_free_floor() -> None:
+    pieces = find_walls(*cloud(face([0, 0], [3.5, 0]), face([5.0, 1.2], [5.0, 3.0], seed=1)), least_height=1.2)
+    hidden = joined_behind_furniture(pieces, lambda places: np.zeros(len(places), bool))
+    assert sorted(wall.length for wall in hidden) == pytest.approx([3.0, 5.0], abs=0.03)
+    seen = joined_behind_furniture(pieces, lambda places: np.ones(len(places), bool))
+    assert sorted(wall.length for wall in seen) == pytest.approx([1.8, 3.5], abs=0.03)
