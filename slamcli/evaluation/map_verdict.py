@@ -76,6 +76,7 @@ def judge(evidence: Evidence, *, max_range: float) -> Verdict:
     """
     is_small = evidence.free_area < max(LEAST_FREE, evidence.path_area)
     is_poor = is_small or evidence.views_with_floor < LEAST_FLOOR * evidence.views or not evidence.is_floor_found
+    # A map is unusable when it is poor, whatever the causes named for it, or doubled; all else is worth a word only.
     if is_poor:
         why = [*_wall(evidence), *_holes(evidence), *_floor(evidence, max_range)] or [_small(evidence)]
     else:

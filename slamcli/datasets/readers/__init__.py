@@ -1,7 +1,7 @@
 """The layouts that open. A reader is one module here and one row of READERS.
 
-A reader's module has ``recognises(path) -> bool``, which looks at names only, and ``read(path) -> Recorded``, which finds images, stamps
-and calibration; everything after that is the same for all and is done in `slamcli.datasets.assembly`.
+A reader's module has ``recognises(path) -> bool``, which looks at names and first bytes, and ``read(path) -> Recorded``, which
+finds images, stamps and calibration; everything after that is the same for all and is done in `slamcli.datasets.assembly`.
 """
 
 from dataclasses import dataclass
