@@ -1,10 +1,11 @@
 """Ordered work on a few threads. OpenCV and the kernels release the GIL, so threads are enough: nothing is pickled or copied."""
 
-from collections import deque
+from collections import OrderedDict, deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from typing import TypeVar
+from threading import Lock
+from typing import Generic, TypeVar
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -68,3 +69,24 @@ def _one_thread_in_opencv() -> Iterator[None]:
         yield
     finally:
         cv2.setNumThreads(before)
+
+
+class LastUsed(Generic[Result]):
+    """Values by number, those used last kept. Several threads may ask at once."""
+
+    def __init__(self, most: int) -> None:
+        self._most, self._lock = most, Lock()
+        self._kept: OrderedDict[int, Result] = OrderedDict()
+
+    def get(self, number: int, make: Callable[[int], Result]) -> Result:
+        """Return the value of a number, made by `make` where it is not kept."""
+        with self._lock:
+            if number in self._kept:
+                self._kept.move_to_end(number)
+                return self._kept[number]
+        made = make(number)  # by two threads at once at worst: both make the same
+        with self._lock:
+            self._kept[number] = made
+            if len(self._kept) > self._most:
+                self._kept.popitem(last=False)
+        return made

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from threadpoolctl import threadpool_info
 
-from slamcli.parallel import least_instructions_in_opencv, one_thread_in_blas, ordered_map
+from slamcli.parallel import LastUsed, least_instructions_in_opencv, one_thread_in_blas, ordered_map
 
 
 @settings(max_examples=30, deadline=None)
@@ -102,3 +102,15 @@ def test_opencv_keeps_to_the_least_instructions_meanwhile_and_gets_the_others_ba
     with pytest.raises(KeyError):
         fail()
     assert cv2.useOptimized() == before
+
+
+def test_what_was_used_last_is_kept_and_the_rest_made_again() -> None:
+    made: list[int] = []
+    kept: LastUsed[int] = LastUsed(2)
+
+    def square(number: int) -> int:
+        made.append(number)
+        return number**2
+
+    assert [kept.get(number, square) for number in (1, 2, 1, 3, 1, 2)] == [1, 4, 1, 9, 1, 4]
+    assert made == [1, 2, 3, 2], "2 was used longest ago when 3 came"

@@ -1,13 +1,12 @@
 """The coarse depth images of a recording, kept in lossless code and decoded as they are asked for: half the size, and few are needed at a time."""
 
-from collections import OrderedDict
 from collections.abc import Callable, Iterable
-from threading import Lock
 
 import numpy as np
 
 from slamcli.errors import SlamError
 from slamcli.formats import rvl
+from slamcli.parallel import LastUsed
 from slamcli.schema import CoarseDepth
 
 KEPT = 256  # decoded images, of 38 kB each: views are compared with those up to a second before and after
@@ -32,8 +31,7 @@ class CoarseImages:
         self._depth, self._change = depth, change
         rows, columns = (int(n) for n in depth.coarse_shape)
         self.shape = len(depth.coarse_offset) - 1, rows, columns
-        self._kept: OrderedDict[int, np.ndarray] = OrderedDict()
-        self._lock = Lock()
+        self._kept: LastUsed[np.ndarray] = LastUsed(KEPT)
 
     def __len__(self) -> int:
         return self.shape[0]
@@ -46,16 +44,7 @@ class CoarseImages:
     def __getitem__(self, frame: int) -> np.ndarray:
         """Return a frame's image, not to be written to."""
         frame = range(len(self))[frame]
-        with self._lock:
-            if frame in self._kept:
-                self._kept.move_to_end(frame)
-                return self._kept[frame]
-        found = self._decode(frame)  # by two threads at once at worst: both find the same
-        with self._lock:
-            self._kept[frame] = found
-            if len(self._kept) > KEPT:
-                self._kept.popitem(last=False)
-        return found
+        return self._kept.get(frame, self._decode)
 
     def of(self, frames: Iterable[int]) -> np.ndarray:
         """Return the images (N, V, U) of some frames."""

@@ -1,9 +1,7 @@
 """Frames and key frames placed by depth ICP, where texture ends."""
 
-from collections import OrderedDict
 from dataclasses import dataclass
 from itertools import chain
-from threading import Lock
 
 import numpy as np
 
@@ -14,7 +12,7 @@ from slamcli.depth.icp import Alignment, OrientedPoints, PosePrior
 from slamcli.geometry import se3
 from slamcli.geometry.algebra import product
 from slamcli.geometry.camera import Camera
-from slamcli.parallel import ordered_map
+from slamcli.parallel import LastUsed, ordered_map
 from slamcli.sparse_map.sparse_map import SparseMap
 
 LEAST_POINTS = 0.05  # share of the coarse pixels that must show a surface
@@ -33,8 +31,7 @@ class FramePoints:
     def __init__(self, images: CoarseImages, given: Camera, sensor: SensorConfig, *, camera: Camera | None = None) -> None:
         """Take the coarse depth images, read under the calibration `given`; camera : what is known of the camera, if more."""
         self._images, self._given, self._camera, self._sensor = images, given, camera or given, sensor
-        self._kept: OrderedDict[int, OrientedPoints | None] = OrderedDict()
-        self._lock = Lock()
+        self._kept: LastUsed[OrientedPoints | None] = LastUsed(KEPT)
 
     def under(self, camera: Camera) -> "FramePoints":
         """Return the points as another calibration of the same camera gives them."""
@@ -42,16 +39,7 @@ class FramePoints:
 
     def of(self, frame: int) -> OrientedPoints | None:
         """Return the points of a frame, None where it shows too little."""
-        with self._lock:
-            if frame in self._kept:
-                self._kept.move_to_end(frame)
-                return self._kept[frame]
-        found = self._make(frame)  # by two threads at once at worst: both find the same
-        with self._lock:
-            self._kept[frame] = found
-            if len(self._kept) > KEPT:
-                self._kept.popitem(last=False)
-        return found
+        return self._kept.get(frame, self._make)
 
     def _make(self, frame: int) -> OrientedPoints | None:
         images = self._images
