@@ -16,8 +16,10 @@ from slamcli.depth import icp
 from slamcli.estimation import bundle_adjustment
 from slamcli.geometry import octree, se3
 from slamcli.schema import LOST, Features, Map, Matches, Tracks, Words, frame_poses
+from slamcli.slam.recording import Recording
 from slamcli.slam.tracker import Tracker
 from slamcli.sparse_map import map_adjustment
+from slamcli.sparse_map.frame import FrameStore
 from slamcli.sparse_map.sparse_map import SparseMap
 
 
@@ -36,7 +38,8 @@ def track(run: slamcli.Run, n_frames: int = 40) -> tuple[Tracks, Map]:
         run.directory.load(cls, stage) for cls, stage in ((Features, "extract"), (Words, "match"), (Matches, "match"))
     )
     config = run.config()
-    tracker = Tracker(features, words, matches, run.camera("extract"), config.track, config.sensor, np.random.default_rng(config.seed))
+    frames = FrameStore(features, run.camera("extract"), config.sensor)
+    tracker = Tracker(Recording(frames, words, matches), config.track, np.random.default_rng(config.seed))
     n_frames = min(n_frames, len(features.stamp))
     for i in range(n_frames):
         tracker.process(i)

@@ -4,9 +4,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from slamcli.config.options import SensorConfig
 from slamcli.geometry import se3
 from slamcli.geometry.camera import Camera
 from slamcli.schema import Features, Matches, Words
+from slamcli.slam.recording import Recording
+from slamcli.sparse_map.frame import FrameStore
 
 CAMERA = Camera(640, 480, 520.0, 520.0, 320.0, 240.0)
 OCTAVE_SCALE = 1.2
@@ -23,6 +26,12 @@ class Scene:
     T_gc: np.ndarray  # (F, 4, 4) camera to world, true
     landmark: np.ndarray  # (M,) true landmark of each feature row
     xyz: np.ndarray  # (L, 3) true landmarks
+
+    def frames(self, sensor: SensorConfig) -> FrameStore:
+        return FrameStore(self.features, CAMERA, sensor)
+
+    def recording(self, sensor: SensorConfig) -> Recording:
+        return Recording(self.frames(sensor), self.words, self.matches)
 
 
 def look_at(position: np.ndarray, target: np.ndarray) -> np.ndarray:

@@ -17,8 +17,10 @@ from slamcli.runs.run_directory import RunDir
 from slamcli.schema import LOST, Features, Map, Matches, Timing, Tracks, Trajectory, Words, trajectory
 from slamcli.slam import final_refinement
 from slamcli.slam.depth_tracking import FramePoints
-from slamcli.slam.localizer import Localizer
+from slamcli.slam.localizer import KnownMap, Localizer
 from slamcli.slam.place_recognition import PlaceIndex
+from slamcli.slam.recording import Recording
+from slamcli.sparse_map.frame import FrameStore
 from slamcli.sparse_map.sparse_map import SparseMap
 from slamcli.stages import measurements
 from slamcli.stages.moving_parts import coarse_images
@@ -71,34 +73,33 @@ def _find(run: RunDir, new: RunDir, config: Config, progress: Progress) -> Local
         features = self_calibration.recalibrate(features, given, camera)
     else:
         camera = new.camera()
-    localizer = Localizer(
+    known = KnownMap(
         sparse_map,
         PlaceIndex(run.load(Words, "match"), sparse_map.kf.frame),
-        features,
+        FramePoints(coarse_images(run), given, config.sensor).under(run.camera("loop")),
+    )
+    recording = Recording(
+        FrameStore(features, camera, config.sensor),
         new.load(Words, "match"),
         new.load(Matches, "match"),
-        camera,
-        config.track,
-        config.sensor,
-        np.random.default_rng(config.seed),
-        frame_points=FramePoints(coarse_images(new), new.camera(), config.sensor).under(camera),
-        map_frame_points=FramePoints(coarse_images(run), given, config.sensor).under(run.camera("loop")),
+        FramePoints(coarse_images(new), new.camera(), config.sensor).under(camera),
     )
+    localizer = Localizer(known, recording, config.track, np.random.default_rng(config.seed))
     for i in progress(range(len(features.stamp)), "localize"):
         localizer.process(i)
     tracks = localizer.tracks()
     if (tracks.state == LOST).all():
         raise SlamError(f"{new.info()['root']}: no frame was recognized in the map of {run.path}; do both show the same place?")
-    tracks = _refine(sparse_map, features, tracks, when, map_, camera, config, progress)
+    tracks = _refine(sparse_map, recording.frames, tracks, when, map_, config, progress)
     return Localized(trajectory(np.array(features.stamp), tracks, map_), len(features.stamp))
 
 
-def _refine(sparse_map, features, tracks: Tracks, when: Timing, map_: Map, camera, config: Config, progress: Progress) -> Tracks:
+def _refine(
+    sparse_map: SparseMap, frames: FrameStore, tracks: Tracks, when: Timing, map_: Map, config: Config, progress: Progress
+) -> Tracks:
     """Look at all frames again, their features rectified by the timing that the run found for its camera."""
     for _ in range(LOOKS):
-        moving = replace(when, twist=rolling_shutter.frame_twists(features.stamp, tracks, map_))
-        rectified = rolling_shutter.rectify(features, moving, camera)
-        tracks = final_refinement.refine_frames(
-            sparse_map, rectified, tracks, camera, config.sensor, config.track, progress, workers=config.run.workers
-        )
+        moving = replace(when, twist=rolling_shutter.frame_twists(frames.features.stamp, tracks, map_))
+        rectified = replace(frames, features=rolling_shutter.rectify(frames.features, moving, frames.camera))
+        tracks = final_refinement.refine_frames(sparse_map, rectified, tracks, config.track, progress, workers=config.run.workers)
     return tracks

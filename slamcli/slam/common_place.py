@@ -9,17 +9,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slamcli.config.options import LoopConfig, SensorConfig
+from slamcli.config.options import LoopConfig
 from slamcli.depth.coarse_images import CoarseImages
 from slamcli.geometry import se3
 from slamcli.geometry.algebra import product
-from slamcli.geometry.camera import Camera
 from slamcli.slam import moving_object_kernels as kernels
 from slamcli.slam import moving_objects
 from slamcli.slam.loop_candidates import Candidate
 from slamcli.slam.loop_verification import find_again
 from slamcli.slam.map_merging import Join
 from slamcli.slam.moving_objects import Views
+from slamcli.sparse_map.frame import FrameStore
 from slamcli.sparse_map.sparse_map import SparseMap
 
 AHEAD = 2.0  # [m] before a camera, what it looks at
@@ -52,10 +52,9 @@ class Evidence:
 class Jury:
     """Judges placements of the segments of a map."""
 
-    def __init__(self, sparse_map: SparseMap, depth: CoarseImages, camera: Camera, settings: LoopConfig, sensor: SensorConfig) -> None:
-        """Take the map and the coarse depth images of its frames, seen by `camera`."""
-        self._sparse_map, self._depth, self._camera = sparse_map, depth, camera
-        self._settings, self._sensor = settings, sensor
+    def __init__(self, sparse_map: SparseMap, depth: CoarseImages, frames: FrameStore, settings: LoopConfig) -> None:
+        """Take the map, and the frames of the recording that it is of with their coarse depth images."""
+        self._sparse_map, self._depth, self._frames, self._settings = sparse_map, depth, frames, settings
 
     def objection(self, found: Join) -> str:
         """Say why two segments cannot be one place under a placement, "" when they can."""
@@ -77,7 +76,7 @@ class Jury:
         n, frame = len(self._depth), self._sparse_map.kf.frame
         T_wc = np.full((n, 4, 4), np.nan)
         T_wc[frame] = T_ak
-        views = Views(self._depth, np.zeros(n), T_wc, np.zeros(n, dtype=np.int64), self._camera)
+        views = Views(self._depth, np.zeros(n), T_wc, np.zeros(n, dtype=np.int64), self._frames.camera)
         again = through = 0.0
         for here, there, between in ((b, a, apart), (a, b, apart.T)):
             for row, view in enumerate(here.tolist()):
@@ -100,4 +99,4 @@ class Jury:
 
     def _are_alike(self, T_ak: np.ndarray, i: int, j: int) -> bool:
         T_ia = se3.inverse(T_ak[i])  # j stands in the world of a already
-        return find_again(self._sparse_map, Candidate(i, j, 0.0), T_ia, self._camera, self._settings, self._sensor).is_accepted
+        return find_again(self._sparse_map, Candidate(i, j, 0.0), T_ia, self._frames, self._settings).is_accepted

@@ -1,24 +1,23 @@
 """Final refinement: key frames by their depth images, then every frame by landmarks, meet the final map again. Only a batch program can."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import chain
 
 import numpy as np
 
 from slamcli.calibration import rolling_shutter
-from slamcli.calibration.self_calibration import Sensing
-from slamcli.config.options import SensorConfig, TrackConfig
+from slamcli.config.options import TrackConfig
 from slamcli.estimation.bundle_adjustment import BundleResult
 from slamcli.estimation.camera_pose import PoseEstimate
 from slamcli.geometry import se3
 from slamcli.geometry.algebra import product
-from slamcli.geometry.camera import Camera
 from slamcli.parallel import ordered_map
-from slamcli.schema import KEY_FRAME, LOST, ON_DEPTH, RELOCALIZED, Features, Rests, Tracks
+from slamcli.schema import KEY_FRAME, LOST, ON_DEPTH, RELOCALIZED, Rests, Timing, Tracks
 from slamcli.slam import rests
 from slamcli.slam.depth_tracking import DepthAligner, FramePoints
-from slamcli.sparse_map import guided_matching, map_adjustment
-from slamcli.sparse_map.frame import frame_features, refine_on_landmarks
+from slamcli.sparse_map import landmark_pose, map_adjustment
+from slamcli.sparse_map.frame import FrameStore
+from slamcli.sparse_map.guided_matching import Landmarks
 from slamcli.sparse_map.sparse_map import SparseMap
 
 SHARED = 30  # landmarks of two key frames whose depth images are aligned too
@@ -26,38 +25,42 @@ NEIGHBOURS = 20  # covisible key frames whose landmarks are looked for
 LOST_WIDENING = 8.0  # a lost frame's neighbour stands where a frame's fast turn leaves it, some tens of pixels off
 
 
+@dataclass(frozen=True)
+class DepthEdges:
+    """What depth images are to say of how key frames lie to one another."""
+
+    points: FramePoints  # of the recording that the map is of
+    timing: Timing  # when its depth was measured, and when colour
+    most: int  # covisible key frames that each one is aligned with; 0 = none
+    weight: float = 1.0  # factor on the information of all edges in the adjustment
+
+
 def refine_all(
     sparse_map: SparseMap,
+    frames: FrameStore,
     tracks: Tracks,
-    sensing: Sensing,
-    sensor: SensorConfig,
     settings: TrackConfig,
     *,
-    frame_points: FramePoints,
-    depth_icp_edges: int,
-    depth_icp_weight: float = 1.0,
+    depth: DepthEdges,
     iterations: int,
     progress,
     workers: int = 1,
     stands_still: Rests = rests.NONE,
 ) -> tuple[Tracks, BundleResult | None]:
-    """Align each key frame's depth image with those of up to `depth_icp_edges` covisible ones, adjust the map, refine every frame against it.
+    """Align the depth images of covisible key frames, adjust the map, and refine every frame against it.
 
-    sparse_map : its map is changed; its features are those that `sensing` corrected
-    frame_points : of the recording, of which depth images are taken; depth_icp_weight : factor on what they say in the adjustment
-    workers : threads; the result is the same with any number
+    sparse_map : its map is changed; frames : of the recording that it is of, corrected by what is known of the camera
+    iterations : of the adjustment; workers : threads; the result is the same with any number
     stands_still : when the camera does: the frames of a rest get one pose
     Returns the refined tracks, and the evidence of the adjustment, None where nothing ties two key frames together.
     """
-    if depth_icp_edges:
-        T_cd = rolling_shutter.depth_to_colour(sparse_map.features, sensing.timing, sparse_map.kf.frame)
-        frame_points = frame_points.under(sensing.camera)
-        DepthAligner(sparse_map, frame_points, frame_points).join_covisible(T_cd, most=depth_icp_edges, least=SHARED, workers=workers)
+    if depth.most:
+        T_cd = rolling_shutter.depth_to_colour(frames.features, depth.timing, sparse_map.kf.frame)
+        points = depth.points.under(frames.camera)
+        DepthAligner(sparse_map, points, points).join_covisible(T_cd, most=depth.most, least=SHARED, workers=workers)
     kfs = np.arange(len(sparse_map.kf), dtype=np.int32)
-    result = map_adjustment.adjust(sparse_map, kfs, sensing.camera, sensor, max_iterations=iterations, edge_weight=depth_icp_weight)
-    tracks = refine_frames(
-        sparse_map, sparse_map.features, tracks, sensing.camera, sensor, settings, progress, workers=workers, stands_still=stands_still
-    )
+    result = map_adjustment.adjust(sparse_map, kfs, frames.camera, frames.sensor, max_iterations=iterations, edge_weight=depth.weight)
+    tracks = refine_frames(sparse_map, frames, tracks, settings, progress, workers=workers, stands_still=stands_still)
     return move_key_frames(sparse_map, tracks), result
 
 
@@ -85,10 +88,8 @@ def move_key_frames(sparse_map: SparseMap, tracks: Tracks) -> Tracks:
 
 def refine_frames(
     sparse_map: SparseMap,
-    features: Features,
+    frames: FrameStore,
     tracks: Tracks,
-    camera: Camera,
-    sensor: SensorConfig,
     settings: TrackConfig,
     progress,
     *,
@@ -97,12 +98,12 @@ def refine_frames(
 ) -> Tracks:
     """Refine every frame against the landmarks around it; lost ones are tried from both sides.
 
-    features, tracks : of the frames, which may be of another recording than the map; workers : threads
+    frames, tracks : of a recording, which may be another than the map is of; workers : threads
     stands_still : when the camera does: the frames of a rest get one pose, of as many as that takes
     A frame keeps its pose where much fewer landmarks agree than before, and a key frame also where so few do that depth held it.
     Returns new Tracks; the map stays as it is.
     """
-    refinement = _Refinement(sparse_map, features, tracks, camera, sensor, settings)
+    refinement = _Refinement(sparse_map, frames, tracks, settings)
     n = len(tracks.state)
     # The few landmarks around a frame on shape would make its pose worse.
     chosen = np.flatnonzero((tracks.state != LOST) & (tracks.state != ON_DEPTH) & ~rests.left_out(stands_still, n))
@@ -127,10 +128,9 @@ def refine_frames(
 class _Refinement:
     """The refinement of frames, and what it found."""
 
-    def __init__(
-        self, sparse_map: SparseMap, features: Features, tracks: Tracks, camera: Camera, sensor: SensorConfig, settings: TrackConfig
-    ) -> None:
-        self.sparse_map, self.features, self.camera, self.sensor, self.settings = sparse_map, features, camera, sensor, settings
+    def __init__(self, sparse_map: SparseMap, frames: FrameStore, tracks: Tracks, settings: TrackConfig) -> None:
+        self.sparse_map, self.frames, self.settings = sparse_map, frames, settings
+        self.limits = landmark_pose.search_limits(settings)
         self.T_wc = np.full(tracks.T_kc.shape, np.nan)  # each in the world of its segment
         has_pose = tracks.ref_kf >= 0
         self.T_wc[has_pose] = product(sparse_map.kf.T_wk[tracks.ref_kf[has_pose]], tracks.T_kc[has_pose])
@@ -173,28 +173,12 @@ class _Refinement:
         self.T_wc[moved] = T_wc[moved]
         self.T_kc[moved] = product(se3.inverse(self.sparse_map.kf.T_wk[self.ref_kf[moved]]), T_wc[moved])
 
-    def _find(
-        self, i: int, T_wc: np.ndarray, landmarks: guided_matching.Landmarks, *, widening: float = 1.0, least: int = 0
-    ) -> PoseEstimate | None:
+    def _find(self, i: int, T_wc: np.ndarray, landmarks: Landmarks, *, widening: float = 1.0, least: int = 0) -> PoseEstimate | None:
         """Estimate the pose of frame `i` from a guess; None where fewer landmarks agree than the settings, half of before, or `least` say."""
         wanted = max(least, self.settings.min_inliers, int(self.n_inliers[i]) // 2)
-        frame, T_cw = frame_features(self.features, i, self.camera, self.sensor), se3.inverse(T_wc)
-        feature, _ = guided_matching.search(
-            T_cw,
-            landmarks,
-            frame,
-            self.camera,
-            octave_scale=self.sparse_map.octave_scale,
-            radius_px=widening * self.settings.search_radius_px,
-            max_distance=self.settings.search_max_distance,
-            ratio=self.settings.search_ratio,
-        )
-        which = np.flatnonzero(feature >= 0)
-        if len(which) < wanted:
-            return None
-        estimate = refine_on_landmarks(T_cw, landmarks.xyz[which], frame, feature[which], self.camera)
-        return estimate if estimate.n_inliers >= wanted else None
+        found = landmark_pose.find(se3.inverse(T_wc), landmarks, self.frames[i], self.limits.widened(widening), wanted=wanted)
+        return found.estimate if found.n_agree >= wanted else None
 
-    def _landmarks_around(self, kf: int) -> guided_matching.Landmarks:
+    def _landmarks_around(self, kf: int) -> Landmarks:
         neighbours, _ = self.sparse_map.covisible(kf)
         return self.sparse_map.landmarks(self.sparse_map.landmarks_in(np.append(neighbours[:NEIGHBOURS], kf)))

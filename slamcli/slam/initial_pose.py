@@ -7,9 +7,8 @@ import numpy as np
 from slamcli.config.options import TrackConfig
 from slamcli.estimation import camera_pose
 from slamcli.geometry import se3
-from slamcli.geometry.camera import Camera
 from slamcli.schema import Matches
-from slamcli.sparse_map.frame import refine_on_landmarks
+from slamcli.sparse_map import landmark_pose
 from slamcli.sparse_map.guided_matching import FrameFeatures
 from slamcli.sparse_map.sparse_map import SparseMap
 
@@ -29,9 +28,9 @@ class Correspondences:
 class PreviousFrame:
     """The frame before, with the landmarks that it showed: what the next one is matched with."""
 
-    def __init__(self, sparse_map: SparseMap, matches: Matches, camera: Camera) -> None:
+    def __init__(self, sparse_map: SparseMap, matches: Matches) -> None:
         """Take the matches between neighbouring frames."""
-        self._sparse_map, self._matches, self._camera = sparse_map, matches, camera
+        self._sparse_map, self._matches = sparse_map, matches
         self._pair_of = {(int(i), int(j)): p for p, (i, j) in enumerate(matches.pair)}
         self.features: FrameFeatures | None = None
         self.landmark = np.empty(0, dtype=np.int32)  # of each of its features, -1 = none
@@ -50,14 +49,15 @@ class PreviousFrame:
             return Correspondences(np.empty(0, np.int32), np.empty((0, 3)), np.empty(0, np.int32))
         match = self._matches.row[self._matches.offset[pair] : self._matches.offset[pair + 1]].astype(np.int32)
         ids = self._sparse_map.resolve(self.landmark[match[:, 1]])
-        x_w = se3.transform(T_wp, self._camera.backproject(self.features.xy[match[:, 1]], self.features.depth[match[:, 1]]))
+        x_p = self.features.camera.backproject(self.features.xy[match[:, 1]], self.features.depth[match[:, 1]])
+        x_w = se3.transform(T_wp, x_p)
         x_w[ids >= 0] = self._sparse_map.lm.xyz[ids[ids >= 0]]
         is_usable = np.isfinite(x_w[:, 0])
         return Correspondences(match[is_usable, 0], x_w[is_usable], ids[is_usable])
 
 
 def estimate(
-    found: Correspondences, predicted: np.ndarray, frame: FrameFeatures, camera: Camera, settings: TrackConfig, rng: np.random.Generator
+    found: Correspondences, predicted: np.ndarray, frame: FrameFeatures, settings: TrackConfig, rng: np.random.Generator
 ) -> camera_pose.PoseEstimate | None:
     """Estimate a frame's pose from its correspondences, starting from the predicted T_cw; None if fewer than `min_inliers` agree.
 
@@ -65,16 +65,16 @@ def estimate(
     """
     if len(found) < settings.min_inliers:
         return None
-    best = refine_on_landmarks(predicted, found.x_w, frame, found.row, camera)
+    best = landmark_pose.refine(predicted, found.x_w, frame, found.row)
     if 2 * best.n_inliers <= len(found):
         start = camera_pose.ransac_p3p(
             found.x_w,
             frame.xy[found.row],
-            camera,
+            frame.camera,
             rng=rng,
             rounds=settings.ransac_rounds,
             threshold_px=settings.ransac_threshold_px,
         )
         if start is not None:
-            best = max(best, refine_on_landmarks(start.T_cw, found.x_w, frame, found.row, camera), key=lambda e: e.n_inliers)
+            best = max(best, landmark_pose.refine(start.T_cw, found.x_w, frame, found.row), key=lambda e: e.n_inliers)
     return best if best.n_inliers >= settings.min_inliers else None

@@ -6,13 +6,9 @@ import numpy as np
 
 from slamcli.config.options import TrackConfig
 from slamcli.estimation.camera_pose import PoseEstimate
-from slamcli.geometry.camera import Camera
-from slamcli.sparse_map import guided_matching
-from slamcli.sparse_map.frame import refine_on_landmarks
+from slamcli.sparse_map import landmark_pose
 from slamcli.sparse_map.guided_matching import FrameFeatures
 from slamcli.sparse_map.sparse_map import SparseMap
-
-WIDER = 3.0  # times the search radius, where the first search finds little
 
 
 @dataclass(frozen=True)
@@ -26,8 +22,8 @@ class MapMatch:
 class LocalMap:
     """Matches frames with the landmarks around them."""
 
-    def __init__(self, sparse_map: SparseMap, camera: Camera, settings: TrackConfig) -> None:
-        self._sparse_map, self._camera, self._settings = sparse_map, camera, settings
+    def __init__(self, sparse_map: SparseMap, settings: TrackConfig) -> None:
+        self._sparse_map, self._settings = sparse_map, settings
 
     def match(self, frame: FrameFeatures, T_cw: np.ndarray, ids: np.ndarray, *, wanted: int) -> MapMatch | None:
         """Search the frame near pose `T_cw` for the landmarks around `ids`, and refine its pose; None if fewer than `wanted` agree.
@@ -35,34 +31,17 @@ class LocalMap:
         Associations are made anew from the landmarks' own descriptors: handed on from frame to frame they would creep. The map counts
         how often each landmark was visible and found.
         """
-        sparse_map, settings = self._sparse_map, self._settings
-        local = self._landmarks_around(ids)
-        candidates = sparse_map.landmarks(local)
-        for radius in (settings.search_radius_px, WIDER * settings.search_radius_px):
-            feature, is_visible = guided_matching.search(
-                T_cw,
-                candidates,
-                frame,
-                self._camera,
-                octave_scale=sparse_map.octave_scale,
-                radius_px=radius,
-                max_distance=settings.search_max_distance,
-                ratio=settings.search_ratio,
-            )
-            which = np.flatnonzero(feature >= 0)
-            if len(which) >= 2 * settings.min_inliers:
-                break
-        if len(which) < wanted:
+        local, lm = self._landmarks_around(ids), self._sparse_map.lm
+        limits, enough = landmark_pose.search_limits(self._settings), 2 * self._settings.min_inliers
+        found = landmark_pose.find(T_cw, self._sparse_map.landmarks(local), frame, limits, wanted=wanted, enough=enough)
+        if found.estimate is None or found.estimate.n_inliers < wanted:
             return None
-        estimate = refine_on_landmarks(T_cw, candidates.xyz[which], frame, feature[which], self._camera)
-        if estimate.n_inliers < wanted:
-            return None
+        agrees = found.estimate.is_inlier
         landmark = np.full(len(frame), -1, dtype=np.int32)
-        agreed = which[estimate.is_inlier]
-        landmark[feature[agreed]] = local[agreed]
-        sparse_map.lm.n_visible[local[is_visible]] += 1
-        sparse_map.lm.n_found[local[agreed]] += 1
-        return MapMatch(estimate, landmark)
+        landmark[found.feature[agrees]] = local[found.landmark[agrees]]
+        lm.n_visible[local[found.is_visible]] += 1
+        lm.n_found[local[found.landmark[agrees]]] += 1
+        return MapMatch(found.estimate, landmark)
 
     def _landmarks_around(self, ids: np.ndarray) -> np.ndarray:
         """List the landmarks of the key frames that see most of `ids`, and of those most covisible with the first of these."""

@@ -5,9 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slamcli.config.options import SensorConfig, TrackConfig
-from slamcli.geometry.camera import Camera
-from slamcli.schema import ON_DEPTH, RELOCALIZED, TRACKED, Features, Matches, Tracks, Words
+from slamcli.config.options import TrackConfig
+from slamcli.schema import ON_DEPTH, RELOCALIZED, TRACKED, Tracks
 from slamcli.slam import background_prior, initial_pose
 from slamcli.slam.depth_localization import DepthLocalizer, DepthMatch
 from slamcli.slam.depth_tracking import NO_FRAME_POINTS, DepthAligner, FramePoints, Placement
@@ -15,14 +14,23 @@ from slamcli.slam.frame_poses import FramePoses
 from slamcli.slam.initial_pose import PreviousFrame
 from slamcli.slam.local_map import LocalMap, MapMatch
 from slamcli.slam.place_recognition import PlaceIndex
+from slamcli.slam.recording import Recording
 from slamcli.slam.relocalization import Relocalizer
-from slamcli.sparse_map.frame import frame_features
 from slamcli.sparse_map.guided_matching import FrameFeatures
 from slamcli.sparse_map.sparse_map import SparseMap
 
 
 def no_reference(i: int) -> None:
     """Offer no further key frame: the map is not to grow."""
+
+
+@dataclass(frozen=True)
+class KnownMap:
+    """The map that frames are looked for in."""
+
+    sparse_map: SparseMap
+    places: PlaceIndex  # of its key frames
+    points: FramePoints = NO_FRAME_POINTS  # of the recording that it is of
 
 
 @dataclass(frozen=True)
@@ -41,44 +49,32 @@ class Localizer:
 
     def __init__(
         self,
-        sparse_map: SparseMap,
-        places: PlaceIndex,
-        features: Features,
-        words: Words,
-        matches: Matches,
-        camera: Camera,
+        known: KnownMap,
+        recording: Recording,
         settings: TrackConfig,
-        sensor: SensorConfig,
         rng: np.random.Generator,
         *,
-        frame_points: FramePoints = NO_FRAME_POINTS,
-        map_frame_points: FramePoints = NO_FRAME_POINTS,
         background: np.ndarray | None = None,
         make_reference: Callable[[int], int | None] = no_reference,
     ) -> None:
-        """Take the map with the index of its key frames, and a recording's features, words and matches of neighbouring frames.
+        """Take the map, and the recording whose frames are found in it, which may be another than the map is of.
 
-        frame_points, map_frame_points : of that recording, and of the one that the map is of; without them, texture alone is followed
-        background : see FramePoses; make_reference : see DepthLocalizer
+        background : see KnownMotion; make_reference : see DepthLocalizer
         """
-        self._sparse_map, self._features, self._camera = sparse_map, features, camera
-        self._settings, self._sensor, self._rng = settings, sensor, rng
-        self.poses = FramePoses(sparse_map, features.stamp, background)
-        self.previous = PreviousFrame(sparse_map, matches, camera)
-        self.aligner = DepthAligner(sparse_map, map_frame_points, frame_points)
-        self._local_map = LocalMap(sparse_map, camera, settings)
+        sparse_map = known.sparse_map
+        self._sparse_map, self._frames, self._settings, self._rng = sparse_map, recording.frames, settings, rng
+        self.poses = FramePoses(sparse_map, recording.stamp, background)
+        self.previous = PreviousFrame(sparse_map, recording.matches)
+        self.aligner = DepthAligner(sparse_map, known.points, recording.points)
+        self._local_map = LocalMap(sparse_map, settings)
         self._by_depth = DepthLocalizer(sparse_map, self.poses, self.aligner, self._local_map, settings, make_reference=make_reference)
-        self._relocalizer = Relocalizer(sparse_map, places, words, camera, settings, rng)
+        self._relocalizer = Relocalizer(sparse_map, known.places, recording.words, settings, rng)
 
     def process(self, i: int) -> None:
         """Find the pose of frame `i`; frames come in order."""
-        frame = self.features_of(i)
+        frame = self._frames[i]
         location = self.locate(i, frame)
         self.previous.remember(frame, nothing_seen(frame) if location is None else location.landmark)
-
-    def features_of(self, i: int) -> FrameFeatures:
-        """Gather the features of frame `i`."""
-        return frame_features(self._features, i, self._camera, self._sensor)
 
     def tracks(self) -> Tracks:
         """Return the pose of every frame processed."""
@@ -113,7 +109,7 @@ class Localizer:
             return None
         predicted = self.poses.predict(i, i - 1)
         pairs = self.previous.correspondences(i, self.poses.T_wc(i - 1))
-        estimate = initial_pose.estimate(pairs, predicted, frame, self._camera, self._settings, self._rng)
+        estimate = initial_pose.estimate(pairs, predicted, frame, self._settings, self._rng)
         if estimate is None:
             start, seeds = predicted, self.previous.landmark
         else:

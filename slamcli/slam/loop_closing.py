@@ -5,8 +5,7 @@ from collections.abc import Callable, Iterable
 
 import numpy as np
 
-from slamcli.config.options import LoopConfig, SensorConfig
-from slamcli.geometry.camera import Camera
+from slamcli.config.options import LoopConfig
 from slamcli.schema import Words
 from slamcli.slam import loop_pose_graph, map_merging
 from slamcli.slam.loop_candidates import Candidate, Claims, find_alike, find_by_pose, first_of_each_revisit
@@ -14,6 +13,7 @@ from slamcli.slam.loop_verification import verify
 from slamcli.slam.map_merging import Join
 from slamcli.slam.place_recognition import PlaceIndex
 from slamcli.sparse_map import map_adjustment
+from slamcli.sparse_map.frame import FrameStore
 from slamcli.sparse_map.landmark_fusion import fuse_landmarks
 from slamcli.sparse_map.sparse_map import SparseMap
 
@@ -30,21 +30,19 @@ class LoopCloser:
         self,
         sparse_map: SparseMap,
         words: Words,
-        camera: Camera,
+        frames: FrameStore,
         settings: LoopConfig,
-        sensor: SensorConfig,
         rng: np.random.Generator,
         *,
         progress: Callable[..., Iterable],
         objection: Callable[[Join], str] = no_objection,
     ) -> None:
-        """Take the map with the words of the recording that it is of.
+        """Take the map with the words and frames of the recording that it is of.
 
         progress : wraps the candidates while they are verified; objection : says why two segments cannot be one place, "" when they can
         """
-        self._sparse_map, self._words, self._camera = sparse_map, words, camera
-        self._settings, self._sensor, self._rng, self._progress = settings, sensor, rng, progress
-        self._objection = objection
+        self._sparse_map, self._words, self._frames, self._settings, self._rng = sparse_map, words, frames, settings, rng
+        self._progress, self._objection = progress, objection
         self._places = PlaceIndex(words, sparse_map.kf.frame)
         self.fate: dict[tuple[int, int], Candidate] = {}
 
@@ -120,7 +118,7 @@ class LoopCloser:
             self._fuse_around(closure)
         sparse_map.refresh(np.flatnonzero(sparse_map.lm.is_alive).astype(np.int32))
         kfs = np.arange(len(sparse_map.kf), dtype=np.int32)
-        map_adjustment.adjust(sparse_map, kfs, self._camera, self._sensor, max_iterations=self._settings.iterations)
+        map_adjustment.adjust(sparse_map, kfs, self._frames.camera, self._frames.sensor, max_iterations=self._settings.iterations)
 
     def _fuse_around(self, closure: Candidate) -> None:
         """Find the landmarks of each side in the key frames of the other side."""
@@ -131,10 +129,10 @@ class LoopCloser:
         for here, there in (sides, sides[::-1]):
             for kf in here:
                 landmarks, most = self._sparse_map.landmarks_in(there), self._settings.fuse_max_distance
-                fuse_landmarks(self._sparse_map, int(kf), landmarks, self._camera, self._sensor, max_distance=most)
+                fuse_landmarks(self._sparse_map, int(kf), landmarks, self._frames, max_distance=most)
 
     def _verified(self, candidate: Candidate) -> Candidate:
-        return verify(self._sparse_map, self._words, candidate, self._camera, self._settings, self._sensor, self._rng)
+        return verify(self._sparse_map, self._words, candidate, self._frames, self._settings, self._rng)
 
     def _is_between_segments(self, c: Candidate) -> bool:
         segment = self._sparse_map.kf.segment

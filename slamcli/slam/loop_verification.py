@@ -4,15 +4,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from slamcli.config.options import LoopConfig, SensorConfig
+from slamcli.config.options import LoopConfig
 from slamcli.estimation import camera_pose
 from slamcli.geometry import se3
 from slamcli.geometry.algebra import product
-from slamcli.geometry.camera import Camera
 from slamcli.schema import Words
 from slamcli.slam.loop_candidates import Candidate
-from slamcli.sparse_map import guided_matching
-from slamcli.sparse_map.frame import frame_features, refine_on_landmarks
+from slamcli.sparse_map import landmark_pose
+from slamcli.sparse_map.frame import FrameStore
+from slamcli.sparse_map.guided_matching import FrameFeatures, SearchLimits
 from slamcli.sparse_map.sparse_map import SparseMap
 from slamcli.vision import hamming
 
@@ -23,20 +23,12 @@ RATIO = 0.9  # of the best match's distance to the second best's
 
 
 def verify(
-    sparse_map: SparseMap,
-    words: Words,
-    candidate: Candidate,
-    camera: Camera,
-    settings: LoopConfig,
-    sensor: SensorConfig,
-    rng: np.random.Generator,
+    sparse_map: SparseMap, words: Words, candidate: Candidate, frames: FrameStore, settings: LoopConfig, rng: np.random.Generator
 ) -> Candidate:
     """Check a candidate by geometry: 3-D to 3-D RANSAC, for a pair proposed by its poses these; then the landmarks around j looked for in i."""
-    frame_i, frame_j = (
-        frame_features(sparse_map.features, int(sparse_map.kf.frame[kf]), camera, sensor) for kf in (candidate.kf_i, candidate.kf_j)
-    )
+    frame_i, frame_j = (frames[int(sparse_map.kf.frame[kf])] for kf in (candidate.kf_i, candidate.kf_j))
     if candidate.is_by_pose:
-        return _find_landmarks(sparse_map, candidate, frame_i, se3.inverse(sparse_map.kf.T_wk[candidate.kf_i]), camera, settings)
+        return _find_landmarks(sparse_map, candidate, frame_i, se3.inverse(sparse_map.kf.T_wk[candidate.kf_i]), settings)
     node_i, node_j = (np.array(words.node[f.first_row : f.first_row + len(f)]) for f in (frame_i, frame_j))
     rows, _ = hamming.match_nodes(frame_i.desc.view(np.uint8), node_i, frame_j.desc.view(np.uint8), node_j, frame_i.angle, frame_j.angle)
     has_depth = np.isfinite(frame_i.depth[rows[:, 0]]) & np.isfinite(frame_j.depth[rows[:, 1]])
@@ -44,14 +36,14 @@ def verify(
     candidate = replace(candidate, n_matches=len(rows))
     if len(rows) < settings.min_matches:
         return candidate.rejected(f"{len(rows)} of {settings.min_matches} matches")
-    x_i = camera.backproject(frame_i.xy[rows[:, 0]], frame_i.depth[rows[:, 0]])
-    x_j = camera.backproject(frame_j.xy[rows[:, 1]], frame_j.depth[rows[:, 1]])
+    x_i = frames.camera.backproject(frame_i.xy[rows[:, 0]], frame_i.depth[rows[:, 0]])
+    x_j = frames.camera.backproject(frame_j.xy[rows[:, 1]], frame_j.depth[rows[:, 1]])
     start = camera_pose.ransac_rigid(
         x_j,
         x_i,
         frame_j.xy[rows[:, 1]],
         frame_i.xy[rows[:, 0]],
-        camera,
+        frames.camera,
         rng=rng,
         rounds=settings.ransac_rounds,
         threshold_px=settings.ransac_threshold_px,
@@ -59,46 +51,28 @@ def verify(
     if start is None:
         return candidate.rejected("no rigid motion explains the matches")
     T_iw = product(start.T_ba, se3.inverse(sparse_map.kf.T_wk[candidate.kf_j]))
-    return _find_landmarks(sparse_map, candidate, frame_i, T_iw, camera, settings)
+    return _find_landmarks(sparse_map, candidate, frame_i, T_iw, settings)
 
 
-def find_again(
-    sparse_map: SparseMap, candidate: Candidate, T_iw: np.ndarray, camera: Camera, settings: LoopConfig, sensor: SensorConfig
-) -> Candidate:
+def find_again(sparse_map: SparseMap, candidate: Candidate, T_iw: np.ndarray, frames: FrameStore, settings: LoopConfig) -> Candidate:
     """Look for the landmarks around key frame j in key frame i, from a guess of its pose T_iw in the world that j stands in."""
-    frame_i = frame_features(sparse_map.features, int(sparse_map.kf.frame[candidate.kf_i]), camera, sensor)
-    return _find_landmarks(sparse_map, candidate, frame_i, T_iw, camera, settings)
+    frame_i = frames[int(sparse_map.kf.frame[candidate.kf_i])]
+    return _find_landmarks(sparse_map, candidate, frame_i, T_iw, settings)
 
 
 def _find_landmarks(
-    sparse_map: SparseMap,
-    candidate: Candidate,
-    frame_i: guided_matching.FrameFeatures,
-    T_iw: np.ndarray,
-    camera: Camera,
-    settings: LoopConfig,
+    sparse_map: SparseMap, candidate: Candidate, frame_i: FrameFeatures, T_iw: np.ndarray, settings: LoopConfig
 ) -> Candidate:
     """Look for the landmarks around j in i, from a guess of its pose T_iw in the world that j stands in."""
     neighbours, _ = sparse_map.covisible(candidate.kf_j)
-    ids = sparse_map.landmarks_in(np.append(neighbours[: settings.neighbours], candidate.kf_j))
-    landmarks = sparse_map.landmarks(ids)
+    landmarks = sparse_map.landmarks(sparse_map.landmarks_in(np.append(neighbours[: settings.neighbours], candidate.kf_j)))
+    limits, wanted = SearchLimits(settings.search_radius_px, MAX_DISTANCE, RATIO), settings.min_inliers
     for widening in WIDENINGS:
-        feature, _ = guided_matching.search(
-            T_iw,
-            landmarks,
-            frame_i,
-            camera,
-            octave_scale=sparse_map.octave_scale,
-            radius_px=widening * settings.search_radius_px,
-            max_distance=MAX_DISTANCE,
-            ratio=RATIO,
-        )
-        which = np.flatnonzero(feature >= 0)
-        if len(which) < settings.min_inliers:
-            return replace(candidate, n_inliers=len(which)).rejected(f"{len(which)} of {settings.min_inliers} landmarks found again")
-        estimate = refine_on_landmarks(T_iw, landmarks.xyz[which], frame_i, feature[which], camera)
-        T_iw = estimate.T_cw
-    candidate = replace(candidate, n_inliers=estimate.n_inliers)
-    if estimate.n_inliers < settings.min_inliers:
-        return candidate.rejected(f"{estimate.n_inliers} of {settings.min_inliers} landmarks agree")
+        found = landmark_pose.find(T_iw, landmarks, frame_i, limits.widened(widening), wanted=wanted)
+        if found.estimate is None:
+            return replace(candidate, n_inliers=found.n_found).rejected(f"{found.n_found} of {wanted} landmarks found again")
+        T_iw = found.estimate.T_cw
+    candidate = replace(candidate, n_inliers=found.n_agree)
+    if found.n_agree < wanted:
+        return candidate.rejected(f"{found.n_agree} of {wanted} landmarks agree")
     return replace(candidate, T_ij=product(T_iw, sparse_map.kf.T_wk[candidate.kf_j]))

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from slamcli.config.options import SensorConfig, TrackConfig
+from slamcli.config.options import TrackConfig
 from slamcli.geometry import se3
-from slamcli.geometry.camera import Camera
 from slamcli.sparse_map import map_adjustment
+from slamcli.sparse_map.frame import FrameStore
 from slamcli.sparse_map.guided_matching import FrameFeatures
 from slamcli.sparse_map.landmark_fusion import fuse_landmarks
 from slamcli.sparse_map.sparse_map import SparseMap
@@ -21,8 +21,9 @@ COVISIBLE = 15  # landmarks that two key frames share at least, to count as neig
 class MapGrowth:
     """Adds key frames to the map."""
 
-    def __init__(self, sparse_map: SparseMap, camera: Camera, settings: TrackConfig, sensor: SensorConfig) -> None:
-        self._sparse_map, self._camera, self._settings, self._sensor = sparse_map, camera, settings, sensor
+    def __init__(self, sparse_map: SparseMap, frames: FrameStore, settings: TrackConfig) -> None:
+        """Take the map and the frames of the recording that it is of."""
+        self._sparse_map, self._frames, self._settings = sparse_map, frames, settings
         self._on_probation = np.empty(0, dtype=np.int32)  # landmarks
 
     def insert(self, i: int, frame: FrameFeatures, T_wc: np.ndarray, landmark: np.ndarray, segment: int) -> tuple[int, np.ndarray]:
@@ -36,7 +37,7 @@ class MapGrowth:
         known = np.flatnonzero(landmark >= 0)
         sparse_map.observe(kf, landmark[known], frame.first_row + known)
         new = np.flatnonzero((landmark < 0) & np.isfinite(frame.depth))
-        x_w = se3.transform(T_wc, self._camera.backproject(frame.xy[new], frame.depth[new]))
+        x_w = se3.transform(T_wc, frame.camera.backproject(frame.xy[new], frame.depth[new]))
         return kf, sparse_map.add_landmarks(kf, frame.first_row + new, x_w)
 
     def cull_share_adjust(self, kf: int, added: np.ndarray, known: np.ndarray) -> None:
@@ -66,7 +67,7 @@ class MapGrowth:
         most = self._settings.share_key_frames
         for other in neighbours[:most][shared[:most] >= COVISIBLE]:
             ids = added[self._sparse_map.lm.is_alive[added]]
-            fuse_landmarks(self._sparse_map, int(other), ids, self._camera, self._sensor, max_distance=self._settings.share_max_distance)
+            fuse_landmarks(self._sparse_map, int(other), ids, self._frames, max_distance=self._settings.share_max_distance)
 
     def _adjust_window(self, kf: int) -> None:
         neighbours, shared = self._sparse_map.covisible(kf)
@@ -77,7 +78,7 @@ class MapGrowth:
         map_adjustment.adjust(
             self._sparse_map,
             np.sort(np.append(window, kf)).astype(np.int32),
-            self._camera,
-            self._sensor,
+            self._frames.camera,
+            self._frames.sensor,
             max_iterations=self._settings.window_iterations,
         )

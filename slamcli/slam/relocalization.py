@@ -4,10 +4,9 @@ import numpy as np
 
 from slamcli.config.options import TrackConfig
 from slamcli.estimation import camera_pose
-from slamcli.geometry.camera import Camera
 from slamcli.schema import Words
 from slamcli.slam.place_recognition import PlaceIndex, bow_vector
-from slamcli.sparse_map.frame import refine_on_landmarks
+from slamcli.sparse_map import landmark_pose
 from slamcli.sparse_map.guided_matching import FrameFeatures
 from slamcli.sparse_map.sparse_map import SparseMap
 from slamcli.vision import hamming
@@ -18,12 +17,10 @@ MORE_ROUNDS = 3  # times the rounds of RANSAC between neighbouring frames: fewer
 class Relocalizer:
     """Finds frames in the map by their bags of words."""
 
-    def __init__(
-        self, sparse_map: SparseMap, places: PlaceIndex, words: Words, camera: Camera, settings: TrackConfig, rng: np.random.Generator
-    ) -> None:
+    def __init__(self, sparse_map: SparseMap, places: PlaceIndex, words: Words, settings: TrackConfig, rng: np.random.Generator) -> None:
         """Take the map with the index of its key frames, and the words of the recording whose frames are looked for."""
         self._sparse_map, self._places, self._words = sparse_map, places, words
-        self._camera, self._settings, self._rng = camera, settings, rng
+        self._settings, self._rng = settings, rng
 
     def find(self, i: int, frame: FrameFeatures) -> tuple[np.ndarray, np.ndarray] | None:
         """Find T_cw (4, 4) of frame `i` and the landmarks (N,) that it shows in the likest key frame that agrees; None in none."""
@@ -36,14 +33,14 @@ class Relocalizer:
             start = camera_pose.ransac_p3p(
                 x_w,
                 frame.xy[row],
-                self._camera,
+                frame.camera,
                 rng=self._rng,
                 rounds=MORE_ROUNDS * self._settings.ransac_rounds,
                 threshold_px=self._settings.ransac_threshold_px,
             )
             if start is None:
                 continue
-            estimate = refine_on_landmarks(start.T_cw, x_w, frame, row, self._camera)
+            estimate = landmark_pose.refine(start.T_cw, x_w, frame, row)
             if estimate.n_inliers >= self._settings.min_inliers:
                 return estimate.T_cw, ids[estimate.is_inlier]
         return None

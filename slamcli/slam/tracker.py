@@ -2,16 +2,16 @@
 
 import numpy as np
 
-from slamcli.config.options import SensorConfig, TrackConfig
+from slamcli.config.options import TrackConfig
 from slamcli.geometry import se3
 from slamcli.geometry.algebra import product
-from slamcli.geometry.camera import Camera
-from slamcli.schema import KEY_FRAME, ON_DEPTH, TRACKED, Features, Map, Matches, Rests, Tracks, Words
+from slamcli.schema import KEY_FRAME, ON_DEPTH, TRACKED, Map, Tracks
 from slamcli.slam import background_prior, key_frames, rests
-from slamcli.slam.depth_tracking import NO_FRAME_POINTS, FramePoints, Placement
-from slamcli.slam.localizer import Localizer, Location, nothing_seen
+from slamcli.slam.depth_tracking import Placement
+from slamcli.slam.localizer import KnownMap, Localizer, Location, nothing_seen
 from slamcli.slam.map_growth import MapGrowth
 from slamcli.slam.place_recognition import PlaceIndex
+from slamcli.slam.recording import NOTHING_KNOWN, KnownMotion, Recording
 from slamcli.sparse_map.guided_matching import FrameFeatures
 from slamcli.sparse_map.sparse_map import SparseMap
 
@@ -24,47 +24,20 @@ class Tracker:
     """
 
     def __init__(
-        self,
-        features: Features,
-        words: Words,
-        matches: Matches,
-        camera: Camera,
-        settings: TrackConfig,
-        sensor: SensorConfig,
-        rng: np.random.Generator,
-        *,
-        frame_points: FramePoints = NO_FRAME_POINTS,
-        background: np.ndarray | None = None,
-        stands_still: Rests = rests.NONE,
+        self, recording: Recording, settings: TrackConfig, rng: np.random.Generator, *, motion: KnownMotion = NOTHING_KNOWN
     ) -> None:
-        """Take a recording's features, words and matches; without `frame_points`, texture alone is followed.
-
-        background : (F, 4, 4) the camera's motion against what stands still, where it was found beforehand: it predicts, and joins key
-            frames
-        stands_still : when the camera does, where that is known: frames in between stay where the first is, and none is a key frame
-        """
-        self._is_still = rests.within(stands_still, len(features.stamp), with_last=False)
-        self._stays = rests.within(stands_still, len(features.stamp), with_last=True)
-        self._settings, self._background = settings, background
-        self._sparse_map = SparseMap(features)
-        self._places = PlaceIndex(words, self._sparse_map.kf.frame)
+        """Begin without a map; motion : what is known of the camera's motion beforehand."""
+        self._frames, self._settings, self._background = recording.frames, settings, motion.background
+        self._is_still = rests.within(motion.stands_still, len(recording.frames), with_last=False)
+        self._stays = rests.within(motion.stands_still, len(recording.frames), with_last=True)
+        self._sparse_map = SparseMap(recording.frames.features)
+        self._places = PlaceIndex(recording.words, self._sparse_map.kf.frame)
+        known = KnownMap(self._sparse_map, self._places, recording.points)
         self._localizer = Localizer(
-            self._sparse_map,
-            self._places,
-            features,
-            words,
-            matches,
-            camera,
-            settings,
-            sensor,
-            rng,
-            frame_points=frame_points,
-            map_frame_points=frame_points,
-            background=background,
-            make_reference=self._add_previous_as_key_frame,
+            known, recording, settings, rng, background=motion.background, make_reference=self._add_previous_as_key_frame
         )
         self._poses, self._previous = self._localizer.poses, self._localizer.previous
-        self._growth = MapGrowth(self._sparse_map, camera, settings, sensor)
+        self._growth = MapGrowth(self._sparse_map, recording.frames, settings)
         self._segment = -1  # that frames are added to; -1 before the first
         self._n_lost = 0  # frames in a row that saw enough and were not recognized
         self._first_lost = -1  # of these
@@ -74,7 +47,7 @@ class Tracker:
 
         Locating by depth may make the frame before it a key frame, see `DepthLocalizer`.
         """
-        frame = self._localizer.features_of(i)
+        frame = self._frames[i]
         if self._segment < 0:
             self._previous.remember(frame, self._start_segment(i, frame))
             return
@@ -189,7 +162,7 @@ class Tracker:
     def _begin_again(self, last: int) -> np.ndarray:
         """Begin a new segment with the first lost frame, nearest to what was seen before, and track those after it up to `last` anew."""
         for i in range(self._first_lost, last + 1):
-            frame = self._localizer.features_of(i)
+            frame = self._frames[i]
             self._previous.remember(frame, self._start_segment(i, frame))
             if self._poses.state[i] == KEY_FRAME:
                 break

@@ -1,6 +1,6 @@
 """Guided matching: landmarks projected into a frame meet the features near by."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numba import f4, f8, i4, i8, u1, u8
@@ -17,8 +17,9 @@ LAST_OCTAVE = 9  # in which a landmark is looked for; one that should appear bey
 
 @dataclass(frozen=True)
 class FrameFeatures:
-    """The features of one frame, in the form the kernels take."""
+    """The features of one frame and the camera that saw them, in the form the kernels take."""
 
+    camera: Camera
     xy: np.ndarray  # (N, 2) float32 px, undistorted
     depth: np.ndarray  # (N,) float32 m, NaN where there is none or it is not trusted
     octave: np.ndarray  # (N,) uint8
@@ -42,6 +43,20 @@ class Landmarks:
     desc: np.ndarray  # (L, 4) uint64
     direction: np.ndarray  # (L, 3) float64, mean unit vector from the key frames that saw it
     reach: np.ndarray  # (L,) float64 m, distance at which the landmark appears at octave 0
+    octave_scale: float  # size ratio of neighbouring octaves
+
+
+@dataclass(frozen=True)
+class SearchLimits:
+    """How far from a landmark's projection a feature may lie, and how much it may differ."""
+
+    radius_px: float  # half the side of the window at octave 0; it grows with the octave that the landmark should appear in
+    max_distance: int  # bits, of descriptors
+    ratio: float  # of the distance to that of the second best feature of the same octave
+
+    def widened(self, times: float) -> "SearchLimits":
+        """Return limits whose window is so many times as large."""
+        return replace(self, radius_px=times * self.radius_px)
 
 
 def sort_into_buckets(xy: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
@@ -69,24 +84,13 @@ def _sort_into_buckets(xy: f4[:, ::1], columns: i8, rows: i8, start: i4[::1], or
         place[bucket[k]] += 1
 
 
-def search(
-    T_cw: np.ndarray,
-    landmarks: Landmarks,
-    frame: FrameFeatures,
-    camera: Camera,
-    *,
-    octave_scale: float,
-    radius_px: float,
-    max_distance: int,
-    ratio: float,
-) -> tuple[np.ndarray, np.ndarray]:
+def search(T_cw: np.ndarray, landmarks: Landmarks, frame: FrameFeatures, limits: SearchLimits) -> tuple[np.ndarray, np.ndarray]:
     """Match each landmark to the feature most like it near its projection.
 
     T_cw : (4, 4) world to camera
-    radius_px : window at octave 0; it grows with the octave the landmark should appear in
-    max_distance, ratio : of descriptors [bits]; the ratio is to the second best of the same octave
     Returns feature : (L,) int32, -1 where none, each feature at most once; is_visible : (L,) bool, the landmark should have been seen.
     """
+    camera = frame.camera
     intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
     return _search(
         np.ascontiguousarray(T_cw),
@@ -102,10 +106,10 @@ def search(
         intrinsics,
         camera.width,
         camera.height,
-        float(octave_scale),
-        float(radius_px),
-        int(max_distance),
-        float(ratio),
+        float(landmarks.octave_scale),
+        float(limits.radius_px),
+        int(limits.max_distance),
+        float(limits.ratio),
     )
 
 

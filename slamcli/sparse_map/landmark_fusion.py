@@ -2,11 +2,10 @@
 
 import numpy as np
 
-from slamcli.config.options import SensorConfig
 from slamcli.geometry import se3
-from slamcli.geometry.camera import Camera
 from slamcli.sparse_map import guided_matching
-from slamcli.sparse_map.frame import frame_features
+from slamcli.sparse_map.frame import FrameStore
+from slamcli.sparse_map.guided_matching import SearchLimits
 from slamcli.sparse_map.sparse_map import SparseMap
 
 WITHIN_SIGMA = 3.0  # of the projection, and of the depth reading, that a feature must lie
@@ -14,27 +13,19 @@ WITHIN_SIGMA = 3.0  # of the projection, and of the depth reading, that a featur
 DEPTH_MARGIN = 0.02
 
 
-def fuse_landmarks(sparse_map: SparseMap, kf: int, ids: np.ndarray, camera: Camera, sensor: SensorConfig, *, max_distance: int) -> int:
+def fuse_landmarks(sparse_map: SparseMap, kf: int, ids: np.ndarray, frames: FrameStore, *, max_distance: int) -> int:
     """Look for landmarks in a key frame: a free feature becomes a view, a landmark that is there already is fused.
 
-    ids : (N,) landmarks; max_distance : of descriptors [bits]
+    ids : (N,) landmarks; frames : of the recording that the map is of; max_distance : of descriptors [bits]
     Returns how many were found. A feature must lie within 3 sigma of the projection, in depth too.
     """
     ids = np.setdiff1d(ids, sparse_map.landmarks_of(kf))
     if len(ids) == 0:
         return 0
-    frame = frame_features(sparse_map.features, int(sparse_map.kf.frame[kf]), camera, sensor)
+    frame = frames[int(sparse_map.kf.frame[kf])]
     T_kw = se3.inverse(sparse_map.kf.T_wk[kf])
-    feature, _ = guided_matching.search(
-        T_kw,
-        sparse_map.landmarks(ids),
-        frame,
-        camera,
-        octave_scale=sparse_map.octave_scale,
-        radius_px=WITHIN_SIGMA * sensor.pixel_noise,
-        max_distance=max_distance,
-        ratio=1.0,
-    )
+    limits = SearchLimits(radius_px=WITHIN_SIGMA * frames.sensor.pixel_noise, max_distance=max_distance, ratio=1.0)
+    feature, _ = guided_matching.search(T_kw, sparse_map.landmarks(ids), frame, limits)
     which = np.flatnonzero(feature >= 0)
     z = se3.transform(T_kw, sparse_map.lm.xyz[ids[which]])[:, 2]
     f = feature[which]

@@ -144,7 +144,8 @@ class SparseMap:
 
     def landmarks(self, ids: np.ndarray) -> Landmarks:
         """Return landmarks in the form that guided matching takes."""
-        return Landmarks(*(column.take(ids, axis=0) for column in (self.lm.xyz, self.lm.desc, self.lm.direction, self.lm.reach)))
+        xyz, desc, direction, reach = (column.take(ids, axis=0) for column in (self.lm.xyz, self.lm.desc, self.lm.direction, self.lm.reach))
+        return Landmarks(xyz, desc, direction, reach, self.octave_scale)
 
     def observations_of(self, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return all observations of landmarks `ids`: index into `ids`, key frame, feature row; sorted by (landmark, key frame)."""

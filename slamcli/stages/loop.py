@@ -15,9 +15,11 @@ from slamcli.schema import LOST, Closures, DepthTimes, Map, Moving, Recordings, 
 from slamcli.slam import doubt, final_refinement, loop_pose_graph, map_segments, pose_doubt
 from slamcli.slam.common_place import Jury
 from slamcli.slam.depth_tracking import FramePoints
+from slamcli.slam.final_refinement import DepthEdges
 from slamcli.slam.loop_candidates import Candidate
 from slamcli.slam.loop_closing import LoopCloser, no_objection
 from slamcli.slam.moving_objects import FOR_MAPS
+from slamcli.sparse_map.frame import FrameStore
 from slamcli.sparse_map.sparse_map import SparseMap
 from slamcli.stages import measurements, moving_parts, of_several
 from slamcli.stages.camera_file import write_camera
@@ -29,27 +31,26 @@ def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
     """Join map segments and close loops until no new one appears; then look at all key frames and frames again."""
     words, tracks = inputs.load(Words, "match"), inputs.load(Tracks, "optimize")
     when, camera = inputs.load(Timing, "optimize"), inputs.camera("optimize")
-    given, sensing = inputs.camera(), Sensing(camera, when, {})
+    given = inputs.camera()
     moving = inputs.load(Moving, "track")
     features, depth = moving_parts.still(inputs, moving)
-    features = measurements.corrected(inputs, features, given, sensing)
+    features = measurements.corrected(inputs, features, given, Sensing(camera, when, {}))
+    frames = FrameStore(features, camera, cfg.sensor)
     sparse_map = SparseMap.from_map(features, inputs.load(Map, "optimize"))
     tried: list[Candidate] = []
     if cfg.loop.enabled and len(sparse_map.kf) > 2:
-        objection = Jury(sparse_map, depth, camera, cfg.loop, cfg.sensor).objection if when.is_of_several else no_objection
-        closer = LoopCloser(sparse_map, words, camera, cfg.loop, cfg.sensor, tools.rng(), progress=tools.progress, objection=objection)
+        objection = Jury(sparse_map, depth, frames, cfg.loop).objection if when.is_of_several else no_objection
+        closer = LoopCloser(sparse_map, words, frames, cfg.loop, tools.rng(), progress=tools.progress, objection=objection)
         tried = closer.close_loops()
     accepted = [c for c in tried if c.is_accepted]
     if accepted and cfg.loop.final_refinement:
+        points = FramePoints(depth, given, cfg.sensor)
         tracks, _ = final_refinement.refine_all(
             sparse_map,
+            frames,
             tracks,
-            sensing,
-            cfg.sensor,
             cfg.track,
-            frame_points=FramePoints(depth, given, cfg.sensor),
-            depth_icp_edges=cfg.loop.depth_icp_edges,
-            depth_icp_weight=cfg.loop.depth_icp_weight,
+            depth=DepthEdges(points, when, most=cfg.loop.depth_icp_edges, weight=cfg.loop.depth_icp_weight),
             iterations=cfg.loop.iterations,
             progress=tools.progress,
             workers=tools.workers,

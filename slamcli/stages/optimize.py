@@ -13,7 +13,9 @@ from slamcli.config.options import Config
 from slamcli.schema import Features, Map, Moving, Rests, Timing, Tracks
 from slamcli.slam import calibration_doubt, doubt, final_refinement, map_segments, rests
 from slamcli.slam.depth_tracking import NO_FRAME_POINTS, FramePoints
+from slamcli.slam.final_refinement import DepthEdges
 from slamcli.sparse_map import map_adjustment
+from slamcli.sparse_map.frame import FrameStore
 from slamcli.sparse_map.sparse_map import SparseMap
 from slamcli.stages import moving_parts
 from slamcli.stages.camera_file import write_camera
@@ -76,12 +78,10 @@ def refine(
     sparse_map.features = self_calibration.correct(features, given, sensing)
     tracks, result = final_refinement.refine_all(
         sparse_map,
+        FrameStore(sparse_map.features, sensing.camera, cfg.sensor),
         tracks,
-        sensing,
-        cfg.sensor,
         cfg.track,
-        frame_points=frame_points,
-        depth_icp_edges=cfg.optimize.depth_icp_edges,
+        depth=DepthEdges(frame_points, sensing.timing, most=cfg.optimize.depth_icp_edges),
         iterations=cfg.optimize.iterations,
         progress=tools.progress,
         workers=tools.workers,

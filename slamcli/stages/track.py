@@ -20,7 +20,9 @@ from slamcli.schema import (
 from slamcli.slam import map_segments, moving_objects, rests
 from slamcli.slam.background_motion import BackgroundMotion
 from slamcli.slam.depth_tracking import FramePoints
+from slamcli.slam.recording import KnownMotion, Recording
 from slamcli.slam.tracker import Tracker
+from slamcli.sparse_map.frame import FrameStore
 from slamcli.stages import moving_parts
 from slamcli.stages.contract import Inputs, Summary, Tools
 from slamcli.stages.map_outputs import save_map
@@ -81,10 +83,8 @@ def _track(inputs: Inputs, moving: Moving, background: np.ndarray | None, cfg: C
     features, depth = moving_parts.still(inputs, moving)
     words, matches, camera = inputs.load(Words, "match"), inputs.load(Matches, "match"), inputs.camera()
     stands_still = rests.find(features, words, matches, camera) if cfg.track.rests else rests.NONE
-    tracker = Tracker(
-        features, words, matches, camera, cfg.track, cfg.sensor, tools.rng(),
-        frame_points=FramePoints(depth, camera, cfg.sensor), background=background, stands_still=stands_still,
-    )  # fmt: skip
+    recording = Recording(FrameStore(features, camera, cfg.sensor), words, matches, FramePoints(depth, camera, cfg.sensor))
+    tracker = Tracker(recording, cfg.track, tools.rng(), motion=KnownMotion(background, stands_still))
     for i in tools.progress(range(len(features.stamp)), "track"):
         tracker.process(i)
     return tracker, stands_still

@@ -64,7 +64,7 @@ def near(scene: Scene, **options) -> list[Candidate]:
 
 def verified(scene: Scene, candidate: Candidate = Candidate(41, 1, 0.5), *, seed: int = 1, drift: float = 0.0, **options) -> Candidate:  # noqa: B008
     rng = np.random.default_rng(seed)
-    return loop_verification.verify(mapped(scene, drift=drift), scene.words, candidate, CAMERA, LoopConfig(**options), SENSOR, rng)
+    return loop_verification.verify(mapped(scene, drift=drift), scene.words, candidate, scene.frames(SENSOR), LoopConfig(**options), rng)
 
 
 # loop: candidates
@@ -143,7 +143,7 @@ def test_landmarks_of_so_many_neighbours_take_part(scene: Scene) -> None:
 
 
 def closer(scene: Scene, sparse_map: SparseMap, *, progress=lambda items, label: items, **options) -> LoopCloser:
-    return LoopCloser(sparse_map, scene.words, CAMERA, LoopConfig(**options), SENSOR, np.random.default_rng(0), progress=progress)
+    return LoopCloser(sparse_map, scene.words, scene.frames(SENSOR), LoopConfig(**options), np.random.default_rng(0), progress=progress)
 
 
 @pytest.mark.shows("loop.fuse_max_distance")
@@ -240,7 +240,7 @@ def refined(monkeypatch: pytest.MonkeyPatch) -> list[dict]:
     """Note what the second look at everything is asked for, instead of taking it."""
     asked: list[dict] = []
 
-    def refine_all(sparse_map, tracks, *_, **options):
+    def refine_all(sparse_map, frames, tracks, *_, **options):
         asked.append(options)
         return tracks, None
 
@@ -260,7 +260,7 @@ def test_loops_are_closed_and_looked_at_again_as_asked(scene: Scene, tmp_path: P
         run = Lap(scene, tmp_path / name, **options)
         run.stage(loop)
         assert (run.summary["loop"]["closures"] > 0) == is_closed and len(refined) == n_looks
-    assert refined[0]["depth_icp_edges"] == 4 and refined[0]["depth_icp_weight"] == 7.0
+    assert refined[0]["depth"].most == 4 and refined[0]["depth"].weight == 7.0
 
 
 @pytest.mark.shows("loop.main_segment")

@@ -19,7 +19,6 @@ from slamcli.slam.map_growth import MapGrowth
 from slamcli.slam.relocalization import Relocalizer
 from slamcli.slam.tracker import Tracker
 from slamcli.sparse_map import map_adjustment
-from slamcli.sparse_map.frame import frame_features
 from slamcli.sparse_map.sparse_map import SparseMap
 from slamcli.stages import track as track_stage
 from slamcli.stages.moving_parts import NOTHING
@@ -34,7 +33,7 @@ def seen(T_gc: np.ndarray | None = None, *, n: int = 8, **settings) -> Scene:
 
 
 def tracked(scene: Scene, **settings) -> Tracker:
-    tracker = Tracker(scene.features, scene.words, scene.matches, CAMERA, TrackConfig(**settings), SENSOR, np.random.default_rng(0))
+    tracker = Tracker(scene.recording(SENSOR), TrackConfig(**settings), np.random.default_rng(0))
     for i in range(len(scene.T_gc)):
         tracker.process(i)
     return tracker
@@ -51,7 +50,7 @@ def mapped(scene: Scene, **settings) -> tuple[SparseMap, MapGrowth]:
         sparse_map.observe(kf, np.array([id_of[landmark] for landmark in of[known].tolist()], np.int32), rows[known])
         ids = sparse_map.add_landmarks(kf, rows[~known], scene.xyz[of[~known]])
         id_of |= dict(zip(of[~known].tolist(), ids.tolist(), strict=True))
-    return sparse_map, MapGrowth(sparse_map, CAMERA, TrackConfig(**settings), SENSOR)
+    return sparse_map, MapGrowth(sparse_map, scene.frames(SENSOR), TrackConfig(**settings))
 
 
 # sensor
@@ -118,14 +117,14 @@ def n_found(*, noise: float, **settings) -> int:
     """Of twelve frames of which three fifths of the matches are wrong and whose motion is unknown, count those that are found."""
     scene, found = seen(n=1, pixel_noise=0.1), 0
     rows = np.arange(150)
-    frame = frame_features(scene.features, 0, CAMERA, SENSOR)
+    frame = scene.frames(SENSOR)[0]
     for seed in range(12):
         rng = np.random.default_rng(seed)
         x = scene.xyz[scene.landmark[rows]] + rng.normal(0, noise, (150, 3))
         x[60:] = rng.permutation(x[60:])
         correspondences = Correspondences(rows, x, np.full(150, -1, np.int32))
         nowhere = se3.inverse(scene.T_gc[0] @ se3.exp(np.array([0.0, 0.0, 0.0, 0.0, 2.5, 0.0])))
-        estimate = initial_pose.estimate(correspondences, nowhere, frame, CAMERA, TrackConfig(**settings), rng)
+        estimate = initial_pose.estimate(correspondences, nowhere, frame, TrackConfig(**settings), rng)
         found += estimate is not None and np.linalg.norm(estimate.T_cw[:3, 3] - se3.inverse(scene.T_gc[0])[:3, 3]) < 0.1
     return found
 
@@ -144,9 +143,9 @@ def meets(scene: Scene, *, off_px: float = 0.0, **settings) -> tuple[int, Sparse
     """Count the landmarks found in the last frame, of a map of those before, from a pose `off_px` off."""
     sparse_map, _ = mapped(replace(scene, T_gc=scene.T_gc[:-1]))
     last = len(scene.T_gc) - 1
-    frame = frame_features(scene.features, last, CAMERA, SENSOR)
+    frame = scene.frames(SENSOR)[last]
     T_cw = se3.exp(np.array([0.0, 0.0, 0.0, 0.0, off_px / CAMERA.fx, 0.0])) @ se3.inverse(scene.T_gc[last])
-    found = LocalMap(sparse_map, CAMERA, TrackConfig(**settings)).match(frame, T_cw, sparse_map.landmarks_of(0), wanted=15)
+    found = LocalMap(sparse_map, TrackConfig(**settings)).match(frame, T_cw, sparse_map.landmarks_of(0), wanted=15)
     return 0 if found is None else int((found.landmark >= 0).sum()), sparse_map
 
 
@@ -188,9 +187,9 @@ def test_a_place_is_found_if_its_key_frame_is_among_those_tried() -> None:
     scene = seen(np.concatenate([sweep(1), sweep(2)[:1] @ turned(np.pi), sweep(2)[:1] @ turned(2.0), sweep(1)]))
     sparse_map, _ = mapped(replace(scene, T_gc=scene.T_gc[:3]))
     places = SimpleNamespace(words=scene.words, query=lambda vector: (np.array([1, 2, 0]), np.array([0.9, 0.8, 0.7])))
-    frame = frame_features(scene.features, 3, CAMERA, SENSOR)
+    frame = scene.frames(SENSOR)[3]
     found = [
-        Relocalizer(sparse_map, places, scene.words, CAMERA, TrackConfig(relocalize_candidates=n), np.random.default_rng(0)).find(3, frame)
+        Relocalizer(sparse_map, places, scene.words, TrackConfig(relocalize_candidates=n), np.random.default_rng(0)).find(3, frame)
         for n in (2, 3)
     ]
     assert found[0] is None and found[1] is not None
@@ -258,7 +257,7 @@ def shared(**settings) -> int:
     """Let a fifth key frame join whose landmarks the others see but do not know; return how many views they gain."""
     scene = seen(n=6)
     sparse_map, growth = mapped(replace(scene, T_gc=scene.T_gc[:5]), **settings)
-    frame = frame_features(scene.features, 5, CAMERA, SENSOR)
+    frame = scene.frames(SENSOR)[5]
     known = np.full(len(frame), -1, np.int32)
     id_of = {int(scene.landmark[row]): int(sparse_map.lm_of_row[row]) for row in range(scene.features.offset[5])}
     rows = np.arange(*scene.features.offset[5:7])

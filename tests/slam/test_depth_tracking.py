@@ -17,8 +17,11 @@ from slamcli.geometry import se3
 from slamcli.schema import KEY_FRAME, LOST, ON_DEPTH, Features, Matches, Timing, Tracks, Words, frame_poses
 from slamcli.slam import final_refinement, loop_pose_graph
 from slamcli.slam.depth_tracking import DepthAligner, FramePoints
+from slamcli.slam.final_refinement import DepthEdges
+from slamcli.slam.recording import Recording
 from slamcli.slam.tracker import Tracker
 from slamcli.sparse_map import map_adjustment
+from slamcli.sparse_map.frame import FrameStore
 from slamcli.sparse_map.sparse_map import SparseMap
 from slamcli.stages import optimize
 
@@ -51,10 +54,8 @@ def blind(n: int) -> tuple[Features, Words, Matches]:
 
 def track(depth: CoarseImages, **settings) -> Tracker:
     features, words, matches = blind(len(depth))
-    frame_points = FramePoints(depth, KINECT, SENSOR)
-    tracker = Tracker(
-        features, words, matches, KINECT, TrackConfig(**settings), SENSOR, np.random.default_rng(0), frame_points=frame_points
-    )
+    recording = Recording(FrameStore(features, KINECT, SENSOR), words, matches, FramePoints(depth, KINECT, SENSOR))
+    tracker = Tracker(recording, TrackConfig(**settings), np.random.default_rng(0))
     for i in range(len(depth)):
         tracker.process(i)
     return tracker
@@ -198,17 +199,18 @@ def test_a_second_look_joins_key_frames_that_see_the_same_and_moves_them_to_wher
         state=np.full(n, KEY_FRAME, np.uint8),
         n_inliers=np.full(n, 60, np.int32),
     )
-    frame_points = FramePoints(coded(corner().of(frames)), KINECT, SENSOR)
-    sensing = Sensing(KINECT, Timing(np.array(0.0), np.array(0.0), np.array(0.0), np.zeros((n, 6))), {})
-    look = {"frame_points": frame_points, "iterations": 20, "progress": lambda items, *_: items}
-    after, result = final_refinement.refine_all(sparse_map, tracks, sensing, SENSOR, TrackConfig(), depth_icp_edges=most, **look)
+    store = FrameStore(sparse_map.features, KINECT, SENSOR)
+    timing = Timing(np.array(0.0), np.array(0.0), np.array(0.0), np.zeros((n, 6)))
+    depth = DepthEdges(FramePoints(coded(corner().of(frames)), KINECT, SENSOR), timing, most=most)
+    look = {"depth": depth, "iterations": 20, "progress": lambda items, *_: items}
+    after, result = final_refinement.refine_all(sparse_map, store, tracks, TrackConfig(), **look)
     assert len(sparse_map.edge) == {0: 0, 1: 3, 6: 6}[most]
     assert (after.state == KEY_FRAME).all() and result.cost[-1] < result.cost[0]
     true = turn(14)[frames]
     e = se3.log((se3.inverse(sparse_map.kf.T_wk[0]) @ sparse_map.kf.T_wk) @ se3.inverse(se3.inverse(true[0]) @ true))
     error = np.linalg.norm(e[1:, :3], axis=1).mean()
     assert 1e-4 < error < 0.01 if most else error > 0.02
-    final_refinement.refine_all(sparse_map, after, sensing, SENSOR, TrackConfig(), depth_icp_edges=most, **look)
+    final_refinement.refine_all(sparse_map, store, after, TrackConfig(), **look)
     assert len(sparse_map.edge) == {0: 0, 1: 3, 6: 6}[most], "no pair is joined twice"
 
 

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scenes import CAMERA, ape, observe, orbit, room_points
+from scenes import ape, observe, orbit, room_points
 
 from slamcli.config.options import LoopConfig, SensorConfig, TrackConfig
 from slamcli.geometry import se3
@@ -24,7 +24,7 @@ def turn():
     """A turn and a bit inside a round room, tracked."""
     rng = np.random.default_rng(0)
     scene = observe(orbit(150, turns=1.1), room_points(9000, rng), rng)
-    tracker = Tracker(scene.features, scene.words, scene.matches, CAMERA, TrackConfig(), SENSOR, np.random.default_rng(0))
+    tracker = Tracker(scene.recording(SENSOR), TrackConfig(), np.random.default_rng(0))
     for i in range(150):
         tracker.process(i)
     assert (tracker.tracks().state != LOST).all()
@@ -46,7 +46,7 @@ def verified(scene, sparse_map) -> list[Candidate]:
     places = PlaceIndex(scene.words, sparse_map.kf.frame)
     rng = np.random.default_rng(1)
     candidates = loop_candidates.find_alike(sparse_map, places, SETTINGS)
-    return [loop_verification.verify(sparse_map, scene.words, c, CAMERA, SETTINGS, SENSOR, rng) for c in candidates]
+    return [loop_verification.verify(sparse_map, scene.words, c, scene.frames(SENSOR), SETTINGS, rng) for c in candidates]
 
 
 def test_similarity_is_symmetric_and_one_for_itself(turn):
@@ -74,7 +74,7 @@ def test_closing_takes_the_drift_out(turn):
     true = scene.T_gc[map_.kf_frame]
     before = ape(sparse_map.kf.T_wk, true)
     n_landmarks = int(sparse_map.lm.is_alive.sum())
-    closer = LoopCloser(sparse_map, scene.words, CAMERA, SETTINGS, SENSOR, np.random.default_rng(1), progress=lambda items, *_: items)
+    closer = LoopCloser(sparse_map, scene.words, scene.frames(SENSOR), SETTINGS, np.random.default_rng(1), progress=lambda items, *_: items)
     tried = closer.close_loops()
     after = ape(sparse_map.kf.T_wk, true)
     assert any(c.is_accepted for c in tried) and [(c.kf_i, c.kf_j) for c in tried] == sorted(closer.fate)
@@ -110,7 +110,7 @@ def test_rejected_candidates_say_why(turn):
     sparse_map = SparseMap.from_map(scene.features, map_)
     strangers = Candidate(len(sparse_map.kf) // 2, 0, 0.9)
     rng = np.random.default_rng(2)
-    fate = loop_verification.verify(sparse_map, scene.words, strangers, CAMERA, SETTINGS, SENSOR, rng)
+    fate = loop_verification.verify(sparse_map, scene.words, strangers, scene.frames(SENSOR), SETTINGS, rng)
     assert not fate.is_accepted and "of 20 matches" in fate.reason
 
 
@@ -119,7 +119,7 @@ def test_final_refinement_finds_lost_frames_and_keeps_the_rest(turn):
     tracks = replace(tracks, **{name: getattr(tracks, name).copy() for name in ("state", "ref_kf", "T_kc")})
     tracks.state[40:44], tracks.ref_kf[40:44], tracks.T_kc[40:44] = LOST, -1, np.nan
     sparse_map = SparseMap.from_map(scene.features, map_)
-    after = final_refinement.refine_frames(sparse_map, scene.features, tracks, CAMERA, SENSOR, TrackConfig(), lambda items, *_: items)
+    after = final_refinement.refine_frames(sparse_map, scene.frames(SENSOR), tracks, TrackConfig(), lambda items, *_: items)
     assert (after.state != LOST).all()
     error = [ape(frame_poses(t, map_), scene.T_gc) for t in (tracks, after)]
     assert 1e-4 < error[1] < error[0] + 0.001
@@ -130,7 +130,7 @@ def test_final_refinement_finds_the_same_with_any_number_of_threads(turn):
     found = []
     for workers in (1, 2, 4):
         sparse_map = SparseMap.from_map(scene.features, map_)
-        look = (sparse_map, scene.features, tracks, CAMERA, SENSOR, TrackConfig(), lambda items, *_: items)
+        look = (sparse_map, scene.frames(SENSOR), tracks, TrackConfig(), lambda items, *_: items)
         found.append(final_refinement.refine_frames(*look, workers=workers))
     assert (found[0].T_kc != tracks.T_kc).any()
     for other in found[1:]:
@@ -146,7 +146,7 @@ def test_final_refinement_matches_key_frames_again_and_the_world_stays_where_it_
     noise[0] = np.eye(4)
     sparse_map.kf.T_wk[:] = sparse_map.kf.T_wk @ noise
     shaken = sparse_map.kf.T_wk.copy()
-    found = final_refinement.refine_frames(sparse_map, scene.features, tracks, CAMERA, SENSOR, TrackConfig(), lambda items, *_: items)
+    found = final_refinement.refine_frames(sparse_map, scene.frames(SENSOR), tracks, TrackConfig(), lambda items, *_: items)
     assert (sparse_map.kf.T_wk == shaken).all(), "to refine frames leaves the map as it is"
     seen, landmarks = frame_poses(found, sparse_map.snapshot()), sparse_map.snapshot().lm_xyz
     after = final_refinement.move_key_frames(sparse_map, found)
@@ -166,7 +166,7 @@ def test_a_key_frame_that_depth_held_keeps_its_pose(turn):
     most = int(tracks.n_inliers.max())
     found = [
         final_refinement.refine_frames(
-            SparseMap.from_map(scene.features, map_), scene.features, tracks, CAMERA, SENSOR, replace(TrackConfig(), depth_icp_below=least),
+            SparseMap.from_map(scene.features, map_), scene.frames(SENSOR), tracks, replace(TrackConfig(), depth_icp_below=least),
             lambda items, *_: items,
         )
         for least in (10 * most, 0)
@@ -186,7 +186,7 @@ def test_views_of_one_spot_are_found_by_their_poses(turn):
     for c in near:
         assert c.is_by_pose and c.kf_j < c.kf_i and np.linalg.norm(spot[c.kf_i] - spot[c.kf_j]) < SETTINGS.near
         assert sparse_map.votes(sparse_map.landmarks_of(c.kf_i))[c.kf_j] < SETTINGS.min_shared
-    fate = [loop_verification.verify(sparse_map, scene.words, c, CAMERA, SETTINGS, SENSOR, np.random.default_rng(0)) for c in near]
+    fate = [loop_verification.verify(sparse_map, scene.words, c, scene.frames(SENSOR), SETTINGS, np.random.default_rng(0)) for c in near]
     accepted = [c for c in fate if c.is_accepted]
     assert any(c.kf_i > 0.9 * len(true) and c.kf_j < 0.15 * len(true) for c in accepted)
     for c in accepted:

@@ -2,11 +2,10 @@
 
 import numpy as np
 import pytest
-from scenes import CAMERA, observe, room_points, sweep
+from scenes import observe, room_points, sweep
 
 from slamcli.config.options import SensorConfig, TrackConfig
 from slamcli.slam.map_growth import MIN_FOUND, PROBATION, MapGrowth
-from slamcli.sparse_map.frame import frame_features
 from slamcli.sparse_map.sparse_map import SparseMap
 
 SENSOR = SensorConfig(pixel_noise=0.5)
@@ -19,14 +18,14 @@ def scene():
 
 
 def insert(growth: MapGrowth, scene, i: int, landmark: np.ndarray | None = None) -> tuple[int, np.ndarray]:
-    frame = frame_features(scene.features, i, CAMERA, SENSOR)
+    frame = scene.frames(SENSOR)[i]
     return growth.insert(i, frame, scene.T_gc[i], np.full(len(frame), -1, np.int32) if landmark is None else landmark, 0)
 
 
 def on_probation(scene, n_key_frames: int = 1) -> tuple[SparseMap, MapGrowth, np.ndarray]:
     """A first key frame whose landmarks are new, and some after it that see nothing of them."""
     sparse_map = SparseMap(scene.features)
-    growth = MapGrowth(sparse_map, CAMERA, TrackConfig(), SENSOR)
+    growth = MapGrowth(sparse_map, scene.frames(SENSOR), TrackConfig())
     _, added = insert(growth, scene, 0)
     growth._on_probation = added
     for i in range(1, n_key_frames):
@@ -36,11 +35,11 @@ def on_probation(scene, n_key_frames: int = 1) -> tuple[SparseMap, MapGrowth, np
 
 def test_every_feature_with_depth_that_shows_no_landmark_becomes_one(scene):
     sparse_map = SparseMap(scene.features)
-    growth = MapGrowth(sparse_map, CAMERA, TrackConfig(), SENSOR)
-    n_depth = np.isfinite(frame_features(scene.features, 0, CAMERA, SENSOR).depth).sum()
+    growth = MapGrowth(sparse_map, scene.frames(SENSOR), TrackConfig())
+    n_depth = np.isfinite(scene.frames(SENSOR)[0].depth).sum()
     kf, added = insert(growth, scene, 0)
     assert (kf, len(added)) == (0, n_depth)
-    frame = frame_features(scene.features, 1, CAMERA, SENSOR)
+    frame = scene.frames(SENSOR)[1]
     landmark = np.full(len(frame), -1, np.int32)
     landmark[:40] = added[:40]
     _, more = insert(growth, scene, 1, landmark)
@@ -67,7 +66,7 @@ def test_what_no_second_key_frame_sees_goes_after_two(scene, kf: int, stays: boo
 
 def test_what_was_confirmed_in_time_is_never_culled_again(scene):
     sparse_map, growth, added = on_probation(scene, PROBATION + 1)
-    frame = frame_features(scene.features, 1, CAMERA, SENSOR)
+    frame = scene.frames(SENSOR)[1]
     sparse_map.observe(1, added[:50], frame.first_row + np.arange(50))
     growth.cull(2)
     np.testing.assert_array_equal(sparse_map.lm.is_alive[added], np.arange(len(added)) < 50)

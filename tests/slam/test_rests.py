@@ -8,6 +8,7 @@ from slamcli.config.options import SensorConfig, TrackConfig
 from slamcli.geometry import se3
 from slamcli.schema import KEY_FRAME, LOST, Features, Rests, frame_poses
 from slamcli.slam import final_refinement, rests
+from slamcli.slam.recording import KnownMotion
 from slamcli.slam.tracker import Tracker
 from slamcli.sparse_map.sparse_map import SparseMap
 
@@ -70,9 +71,8 @@ def test_who_walks_along_is_no_rest_of_the_camera() -> None:
 
 
 def track(scene: Scene, stands_still: Rests) -> Tracker:
-    tracker = Tracker(
-        scene.features, scene.words, scene.matches, CAMERA, TrackConfig(), SENSOR, np.random.default_rng(0), stands_still=stands_still
-    )
+    motion = KnownMotion(stands_still=stands_still)
+    tracker = Tracker(scene.recording(SENSOR), TrackConfig(), np.random.default_rng(0), motion=motion)
     for i in range(len(scene.T_gc)):
         tracker.process(i)
     return tracker
@@ -98,7 +98,7 @@ def test_the_final_refinement_gives_a_rest_one_pose_better_than_a_single_frame_h
         tracker = track(scene, stands_still)
         sparse_map, tracks = SparseMap.from_map(scene.features, tracker.map()), tracker.tracks()
         after = final_refinement.refine_frames(
-            sparse_map, scene.features, tracks, CAMERA, SENSOR, TrackConfig(), lambda items, *_: items, stands_still=spans
+            sparse_map, scene.frames(SENSOR), tracks, TrackConfig(), lambda items, *_: items, stands_still=spans
         )
         T_wc = frame_poses(after, sparse_map.snapshot())[FIRST : LAST + 1]
         error[name] = np.linalg.norm(T_wc[:, :3, 3] - T_wc[:, :3, 3].mean(axis=0), axis=1).max()

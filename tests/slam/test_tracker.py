@@ -15,7 +15,7 @@ SENSOR = SensorConfig(pixel_noise=0.5, depth_noise_base=0.0012, depth_noise_quad
 
 
 def track(scene, **settings) -> Tracker:
-    tracker = Tracker(scene.features, scene.words, scene.matches, CAMERA, TrackConfig(**settings), SENSOR, np.random.default_rng(0))
+    tracker = Tracker(scene.recording(SENSOR), TrackConfig(**settings), np.random.default_rng(0))
     for i in range(len(scene.T_gc)):
         tracker.process(i)
     return tracker

@@ -8,16 +8,17 @@ from scenes import CAMERA
 
 from slamcli.geometry import se3
 from slamcli.sparse_map import guided_matching
-from slamcli.sparse_map.guided_matching import FrameFeatures, Landmarks
+from slamcli.sparse_map.guided_matching import FrameFeatures, Landmarks, SearchLimits
 
 SCALE = 1.2
+LIMITS = SearchLimits(radius_px=5.0, max_distance=64, ratio=0.9)
 
 
 def frame(xy: np.ndarray, desc: np.ndarray, octave: np.ndarray) -> FrameFeatures:
     n, nothing = len(xy), np.full(len(xy), np.nan)
     start, rows = guided_matching.sort_into_buckets(xy, CAMERA)
     return FrameFeatures(
-        xy=xy, depth=nothing, octave=octave, angle=np.zeros(n, np.float32), desc=desc, sigma_px=np.ones(n), sigma_z=nothing, first_row=0,
+        camera=CAMERA, xy=xy, depth=nothing, octave=octave, angle=np.zeros(n, np.float32), desc=desc, sigma_px=np.ones(n), sigma_z=nothing, first_row=0,
         bucket_start=start, bucket_rows=rows,
     )  # fmt: skip
 
@@ -69,7 +70,7 @@ def scene(seed: int, n: int = 300) -> tuple[np.ndarray, Landmarks, FrameFeatures
     distance = np.linalg.norm(sight, axis=1)
     direction = sight / distance[:, None] + rng.normal(0, 0.5, (n, 3))
     landmarks = Landmarks(
-        xyz, desc, direction / np.linalg.norm(direction, axis=1, keepdims=True), distance * SCALE ** rng.uniform(-3.4, 10.4, n)
+        xyz, desc, direction / np.linalg.norm(direction, axis=1, keepdims=True), distance * SCALE ** rng.uniform(-3.4, 10.4, n), SCALE
     )
     seen = np.flatnonzero(x_c[:, 2] > 0.1)
     xy = (CAMERA.project(x_c[seen]) + rng.normal(0, 4, (len(seen), 2))).astype(np.float32)
@@ -85,7 +86,7 @@ def scene(seed: int, n: int = 300) -> tuple[np.ndarray, Landmarks, FrameFeatures
 )
 def test_search_finds_what_the_slow_twin_finds(seed: int, checks: dict) -> None:
     T_cw, landmarks, seen = scene(seed)
-    found = guided_matching.search(T_cw, landmarks, seen, CAMERA, octave_scale=SCALE, radius_px=5.0, **checks)
+    found = guided_matching.search(T_cw, landmarks, seen, SearchLimits(radius_px=5.0, **checks))
     expected = slow_search(T_cw, landmarks, seen, radius_px=5.0, **checks)
     assert expected[1].sum() > 50
     assert checks["max_distance"] < 64 or (expected[0] >= 0).sum() > 5
@@ -96,16 +97,13 @@ def test_search_finds_what_the_slow_twin_finds(seed: int, checks: dict) -> None:
 def test_landmarks_with_values_that_are_not_finite_are_not_seen() -> None:
     T_cw, landmarks, seen = scene(0)
     for change in ({"xyz": landmarks.xyz * np.nan}, {"reach": landmarks.reach * np.nan}, {"reach": landmarks.reach * np.inf}):
-        feature, is_visible = guided_matching.search(
-            T_cw, replace(landmarks, **change), seen, CAMERA, octave_scale=SCALE, radius_px=5.0, max_distance=64, ratio=0.9
-        )
+        feature, is_visible = guided_matching.search(T_cw, replace(landmarks, **change), seen, LIMITS)
         assert not is_visible.any() and (feature == -1).all()
 
 
 def test_without_features_or_landmarks_nothing_is_found() -> None:
     T_cw, landmarks, _ = scene(0)
     nothing = frame(np.zeros((0, 2), np.float32), np.zeros((0, 4), np.uint64), np.zeros(0, np.uint8))
-    options = {"octave_scale": SCALE, "radius_px": 5.0, "max_distance": 64, "ratio": 0.9}
-    assert (guided_matching.search(T_cw, landmarks, nothing, CAMERA, **options)[0] == -1).all()
-    none = Landmarks(np.zeros((0, 3)), np.zeros((0, 4), np.uint64), np.zeros((0, 3)), np.zeros(0))
-    assert len(guided_matching.search(T_cw, none, nothing, CAMERA, **options)[0]) == 0
+    assert (guided_matching.search(T_cw, landmarks, nothing, LIMITS)[0] == -1).all()
+    none = Landmarks(np.zeros((0, 3)), np.zeros((0, 4), np.uint64), np.zeros((0, 3)), np.zeros(0), SCALE)
+    assert len(guided_matching.search(T_cw, none, nothing, LIMITS)[0]) == 0

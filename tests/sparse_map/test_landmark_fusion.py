@@ -5,7 +5,6 @@ import pytest
 from scenes import CAMERA, observe, room_points, sweep
 
 from slamcli.config.options import SensorConfig
-from slamcli.sparse_map.frame import frame_features
 from slamcli.sparse_map.landmark_fusion import fuse_landmarks
 from slamcli.sparse_map.sparse_map import SparseMap
 
@@ -40,17 +39,19 @@ def true_share(sparse_map: SparseMap, scene) -> float:
 def test_a_free_feature_becomes_a_view(two):
     sparse_map, scene, ids = two
     both = np.intersect1d(scene.landmark[sparse_map.rows_of(0)], scene.landmark[sparse_map.rows_of(1)])
-    n = fuse_landmarks(sparse_map, 1, ids, CAMERA, SENSOR, max_distance=50)
+    n = fuse_landmarks(sparse_map, 1, ids, scene.frames(SENSOR), max_distance=50)
     assert 0.7 * len(both) < n <= len(both)
     assert (sparse_map.lm.n_obs[ids] == 2).sum() == n
     assert true_share(sparse_map, scene) > 0.99
-    assert fuse_landmarks(sparse_map, 1, ids[sparse_map.lm.n_obs[ids] == 2], CAMERA, SENSOR, max_distance=50) == 0  # it sees them already
+    assert (
+        fuse_landmarks(sparse_map, 1, ids[sparse_map.lm.n_obs[ids] == 2], scene.frames(SENSOR), max_distance=50) == 0
+    )  # it sees them already
 
 
 def test_a_landmark_that_is_there_already_is_merged_and_the_older_name_leads_to_it(two):
     sparse_map, scene, ids = two
     there = add_landmarks(sparse_map, scene, 1)
-    n = fuse_landmarks(sparse_map, 1, ids, CAMERA, SENSOR, max_distance=50)
+    n = fuse_landmarks(sparse_map, 1, ids, scene.frames(SENSOR), max_distance=50)
     gone = ids[~sparse_map.lm.is_alive[ids]]
     assert len(gone) == n > 100
     kept = sparse_map.resolve(gone)
@@ -61,8 +62,8 @@ def test_a_landmark_that_is_there_already_is_merged_and_the_older_name_leads_to_
 @pytest.mark.parametrize(("shift_px", "nearer"), [(4.0 * SENSOR.pixel_noise * 3.0, 1.0), (0.0, 0.8)])
 def test_what_lies_beside_the_projection_or_at_another_depth_is_left_alone(two, shift_px: float, nearer: float):
     sparse_map, scene, ids = two
-    frame = frame_features(scene.features, 1, CAMERA, SENSOR)
+    frame = scene.frames(SENSOR)[1]
     centre = scene.T_gc[1][:3, 3]
     aside = scene.T_gc[1][:3, 0] * shift_px / CAMERA.fx * np.median(frame.depth)
     sparse_map.lm.xyz[ids] = centre + nearer * (sparse_map.lm.xyz[ids] - centre) + aside
-    assert fuse_landmarks(sparse_map, 1, ids, CAMERA, SENSOR, max_distance=50) < 0.03 * len(ids)
+    assert fuse_landmarks(sparse_map, 1, ids, scene.frames(SENSOR), max_distance=50) < 0.03 * len(ids)
