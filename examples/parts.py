@@ -100,7 +100,7 @@ def adjust(run: slamcli.Run, map_: Map) -> None:
     T_kw = sparse_map.T_kw(part.kfs)
     moved = T_kw.copy()
     moved[-1] = se3.exp(np.array([0.02, 0.0, 0.0, 0.0, 0.0, 0.0])) @ moved[-1]
-    found = bundle_adjustment.adjust(moved, sparse_map.lm.xyz[part.ids], part.seen, camera, is_fixed=part.is_fixed, with_covariance=True)
+    found = bundle_adjustment.adjust(moved, sparse_map.lm.xyz[part.ids], part.seen, camera, is_fixed=part.is_fixed)
 
     print(f"bundle_adjustment.adjust(), {len(part.kfs)} key frames and {len(part.ids)} landmarks")
     line(
@@ -111,9 +111,6 @@ def adjust(run: slamcli.Run, map_: Map) -> None:
     line("cost", f"{found.cost[0]:.0f} at the start, {found.cost[-1]:.0f} at the end: robust chi2 of {len(part.seen)} observations")
     line("chi2, is_inlier", f"{found.is_inlier.mean():.0%} of the observations are within the 95 % quantile")
     line("iterations, is_converged", f"{found.iterations}, {found.is_converged}")
-    if found.covariance is not None:
-        sigma = np.sqrt(np.diag(found.covariance.joint([len(part.kfs) - 1]))[:3])
-        line("covariance", f"the last key frame is known to {1000 * np.linalg.norm(sigma):.1f} mm, given the noise assumed")
 
 
 def apart(T_a: np.ndarray, T_b: np.ndarray) -> float:

@@ -4,13 +4,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from slamcli.estimation import bundle_adjustment
-from slamcli.estimation.bundle_adjustment import Observations
+from slamcli.estimation.bundle_adjustment import BundleResult
+from slamcli.estimation.bundle_problem import Observations, Problem
+from slamcli.estimation.relative_pose_factors import NO_EDGES, Edges
+from slamcli.estimation.robust_loss import LEAST_SQUARES
 from slamcli.geometry import se3
 from slamcli.geometry.camera import Camera
 
 CAMERA = Camera(width=640, height=480, fx=520.0, fy=515.0, cx=319.5, cy=240.5)
-LIMITS = (bundle_adjustment.CHI2_95_2DOF, bundle_adjustment.CHI2_95_3DOF)
 
 
 @dataclass(frozen=True)
@@ -67,3 +68,13 @@ def drive(
 
 def pose_error(T: np.ndarray, T_true: np.ndarray) -> np.ndarray:
     return se3.log(T @ se3.inverse(T_true))
+
+
+def covariance(scene: Scene, found: BundleResult, kfs: list[int], edges: Edges = NO_EDGES) -> np.ndarray:
+    """Joint covariance of the left twists of key frames after an adjustment that held the first: the inverse of the reduced camera system."""
+    problem = Problem(found.T_cw, found.x_w, *scene.problem[2:], scene.first, edges, LEAST_SQUARES)
+    problem.linearize(problem.start)
+    problem.eliminate(1e-9, np.zeros(len(problem.hold)))
+    inverse = problem.system.factorize().solve(np.eye(6 * len(problem.hold)))
+    rows = np.concatenate([6 * problem.place[kf] + np.arange(6) for kf in kfs])
+    return inverse[np.ix_(rows, rows)]

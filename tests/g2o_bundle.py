@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from slamcli.estimation.bundle_adjustment import Observations
+from slamcli.estimation.bundle_problem import Observations
 from slamcli.geometry import se3
 
 

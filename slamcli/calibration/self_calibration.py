@@ -10,8 +10,9 @@ import numpy as np
 
 from slamcli.calibration import rolling_shutter
 from slamcli.config.options import OptimizeConfig, SensorConfig
-from slamcli.estimation import bundle_adjustment, shared_parameters
-from slamcli.estimation.camera_pose import CHI2_95_2DOF, CHI2_95_3DOF
+from slamcli.estimation import shared_parameters
+from slamcli.estimation.bundle_problem import Problem
+from slamcli.estimation.robust_loss import LEAST_SQUARES
 from slamcli.estimation.shared_parameters import Shared
 from slamcli.geometry.camera import Camera
 from slamcli.schema import Features, Timing
@@ -124,19 +125,19 @@ def deviations(sparse_map: SparseMap, now: Sensing, sensor: SensorConfig, *, pri
     found = shared_parameters.estimate(problem, columns, prior=np.zeros(len(prior)), prior_sigma=np.array(list(prior.values())))
     if found is None:
         return None
-    chi2 = problem.chi2(problem.T, problem.x)
-    return Deviations(found, float(chi2[chi2 <= problem.threshold(np.array([CHI2_95_2DOF, CHI2_95_3DOF]))].sum()))
+    chi2 = problem.chi2(problem.start)
+    return Deviations(found, float(chi2[problem.is_inlier(chi2)].sum()))
 
 
 def _ask(
     sparse_map: SparseMap, part: map_adjustment.Part, now: Sensing, prior: dict[str, float]
-) -> tuple[bundle_adjustment.Problem, np.ndarray, float] | None:
+) -> tuple[Problem, np.ndarray, float] | None:
     """Make the problem whose optimum the map is, what each unknown does to its measurements (O, 3, G), and the depth that offsets turn about."""
     if len(part.row) == 0 or not prior:
         return None
     T_kw, x_w = sparse_map.T_kw(part.kfs), sparse_map.lm.xyz[part.ids]
-    problem = bundle_adjustment.Problem(T_kw, x_w, part.seen, now.camera, part.is_fixed, part.edges)
-    predicted = problem.in_given_order(problem.predict(problem.T, problem.x))
+    problem = Problem(T_kw, x_w, part.seen, now.camera, part.is_fixed, part.edges, LEAST_SQUARES)
+    predicted = problem.in_given_order(problem.predict(problem.start))
     # What an offset bends is to turn about readings of this depth, so that it changes no size that the depth scale answers for.
     pivot = float(np.median(predicted[:, 2]))
     columns = [_column(name, sparse_map.features, part.row, predicted, now, sigma, pivot) for name, sigma in prior.items()]

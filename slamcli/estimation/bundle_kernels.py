@@ -1,4 +1,4 @@
-"""Kernels of bundle_adjustment.py: cost, normal equations, elimination of the landmarks, back-substitution.
+"""Kernels of bundle_problem.py: cost, normal equations, elimination of the landmarks, back-substitution.
 
 K key frames of which n are free, L landmarks, O observations. `offset` (L+1,) delimits the observations of a landmark; within a landmark
 they stand in the order of `place` (K,), a key frame's block in the reduced camera system, -1 where the key frame is fixed.

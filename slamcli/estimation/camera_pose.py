@@ -6,11 +6,13 @@ import numpy as np
 
 from slamcli.estimation import pose_kernels as kernels
 from slamcli.estimation.minimal_solvers import p3p, rigid3
+from slamcli.estimation.robust_loss import HUBER, Huber
 from slamcli.geometry import se3
 from slamcli.geometry.algebra import product
 from slamcli.geometry.camera import Camera
 
-CHI2_95_2DOF, CHI2_95_3DOF = 5.991, 7.815  # 95 % quantiles: an observation of a pixel alone, of a pixel and its depth
+# Levenberg-Marquardt between two sortings into inliers and outliers, and how often they are sorted at most, as in ORB-SLAM.
+ITERATIONS, ROUNDS = 10, 4
 
 
 @dataclass(frozen=True)
@@ -111,24 +113,20 @@ def refine_pose(
     sigma_z: np.ndarray,
     camera: Camera,
     *,
-    huber: bool = True,
-    rounds: int = 4,
-    iterations: int = 10,
-    chi2_px: float = CHI2_95_2DOF,
-    chi2_depth: float = CHI2_95_3DOF,
+    loss: Huber = HUBER,
 ) -> PoseEstimate:
     """Refine a pose by Levenberg-Marquardt on the reprojection and depth residuals of fixed landmarks, (6)-(8).
 
     T_cw : (4, 4) start; x_w : (N, 3) [m]; xy : (N, 2) [px, undistorted]; depth : (N,) [m], NaN = the pixel alone counts
     sigma_px, sigma_z : (N,) [px, m] standard deviations of the measurements
     After each round observations are sorted anew into inliers and outliers by chi2, so an early mistake can be mended; it ends when
-    nothing changes. Observations with a value that is not finite are outliers. Huber's kernel acts on an observation as a whole, from
-    the same chi2 on.
+    nothing changes. Observations with a value that is not finite are outliers. The loss acts on an observation as a whole; what it begins
+    to doubt is an outlier.
     """
     start, is_inlier = se3.orthonormalize(T_cw), np.empty(len(x_w), dtype=np.bool_)
     measured = (_cast(xy), _cast(depth), _cast(sigma_px), _cast(sigma_z))
     T, H, cost, total, rms = kernels.refine(
-        start, _points(x_w), *measured, _intrinsics(camera), chi2_px, chi2_depth, huber, rounds, iterations, is_inlier
+        start, _points(x_w), *measured, _intrinsics(camera), *loss, loss.is_robust, ROUNDS, ITERATIONS, is_inlier
     )
     return PoseEstimate(
         T_cw=T,

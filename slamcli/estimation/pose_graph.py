@@ -17,9 +17,9 @@ import numpy as np
 from scipy.sparse.csgraph import connected_components
 
 from slamcli.estimation.pose_graph_solver import Graph
+from slamcli.estimation.robust_loss import CHI2_99_6DOF
 from slamcli.geometry.algebra import product, pseudo_inverse, solve
 
-CHI2_99_6DOF = 16.81
 GROUP_SPAN = 10  # closures whose ends both lie within so many key frames of each other's claim the same revisit
 GROUP_MAX = 30  # more are a lap, not a revisit
 GNC_GROWTH = 2.0  # of the control parameter per round

@@ -7,10 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from slamcli.estimation.robust_loss import CHI2_95_6DOF
 from slamcli.geometry import se3
 from slamcli.geometry.algebra import product
-
-CHI2_95_6DOF = 12.592  # from which Huber's cost grows like the root
 
 
 @dataclass(frozen=True)

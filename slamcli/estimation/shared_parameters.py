@@ -12,9 +12,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slamcli.estimation.bundle_adjustment import DAMPING_MIN, Problem
-from slamcli.estimation.camera_pose import CHI2_95_2DOF, CHI2_95_3DOF
+from slamcli.estimation.bundle_problem import INV_SIGMA_PX, INV_SIGMA_Z, PREDICTED, Problem
 from slamcli.geometry.algebra import inverse, product, solve
+
+# Factor on the diagonal: it regularizes landmarks with one bearing, which bear on nothing, and is lost in the digits of all others.
+LEAST_DAMPING = 1e-9
 
 
 @dataclass(frozen=True)
@@ -26,23 +28,23 @@ class Shared:
 
 
 def estimate(problem: Problem, columns: np.ndarray, *, prior: np.ndarray, prior_sigma: np.ndarray) -> Shared | None:
-    """Estimate the shared numbers at the poses and landmarks that the problem was built with, which are to be its optimum.
+    """Estimate the shared numbers at the problem's start, which is to be its optimum; its loss is to be that of least squares.
 
     columns : (O, 3, G) by how much u, v [px] and depth [m] of each observation grow per unit of each number
     prior, prior_sigma : (G,) what is believed before looking. None where the map is not determined.
     """
-    T, x, columns = problem.T, problem.x, columns[problem.order]
+    columns = columns[problem.order]
     # Outliers stay out; among the inliers Huber's weights are close to 1 and are left out.
-    is_used = problem.chi2(T, x) <= problem.threshold(np.array([CHI2_95_2DOF, CHI2_95_3DOF]))
+    is_used = problem.is_inlier(problem.chi2(problem.start))
     used = problem.measured.copy()
-    used[:, 3:] *= is_used[:, None]
-    sqrt_w = used[:, [3, 3, 4]]
-    r = (problem.predict(T, x) - used[:, :3]) * sqrt_w
+    used[:, [INV_SIGMA_PX, INV_SIGMA_Z]] *= is_used[:, None]
+    sqrt_w = used[:, [INV_SIGMA_PX, INV_SIGMA_PX, INV_SIGMA_Z]]
+    r = (problem.predict(problem.start) - used[:, PREDICTED]) * sqrt_w
     rhs_0, b_0 = _gradient(problem, used)
     reduced, lifted = np.empty((columns.shape[2], len(rhs_0))), np.empty((columns.shape[2], *b_0.shape))
     for g in range(columns.shape[2]):
         shifted = used.copy()
-        shifted[:, :3] += columns[:, :, g]
+        shifted[:, PREDICTED] += columns[:, :, g]
         rhs, b = _gradient(problem, shifted)
         reduced[g], lifted[g] = rhs - rhs_0, b - b_0
     factor = problem.system.factorize()
@@ -61,9 +63,9 @@ def estimate(problem: Problem, columns: np.ndarray, *, prior: np.ndarray, prior_
 
 def _gradient(problem: Problem, measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Compute minus the gradient of the map had the observations measured this: of the reduced system, and of the landmarks."""
-    problem.linearize(problem.T, problem.x, np.array([np.inf, np.inf]), measured=measured)
-    problem.eliminate(DAMPING_MIN, problem.hold)
-    return problem.rhs.copy().ravel(), problem.b_l.copy()
+    problem.linearize(problem.start, measured=measured)
+    problem.eliminate(LEAST_DAMPING, problem.hold)
+    return problem.rhs.copy().ravel(), problem.normal.b_l.copy()
 
 
 def _landmark_product(a: np.ndarray, V_inv: np.ndarray, b: np.ndarray) -> float:

@@ -8,7 +8,7 @@ import numpy as np
 from slamcli.config.options import SensorConfig
 from slamcli.depth import noise_model
 from slamcli.estimation import bundle_adjustment
-from slamcli.estimation.bundle_adjustment import Observations
+from slamcli.estimation.bundle_problem import Observations
 from slamcli.estimation.relative_pose_factors import NO_EDGES, Edges
 from slamcli.geometry import depth_noise, se3
 from slamcli.geometry.algebra import product

@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 
 from slamcli.estimation import camera_pose, minimal_solvers, pose_kernels
-from slamcli.estimation.bundle_adjustment import Observations
+from slamcli.estimation.bundle_problem import Observations
+from slamcli.estimation.robust_loss import HUBER, LEAST_SQUARES, Huber
 from slamcli.geometry import se3
 from slamcli.geometry.camera import Camera
 
 CAMERA = Camera(width=640, height=480, fx=520.0, fy=515.0, cx=319.5, cy=240.5)
-LIMITS = (camera_pose.CHI2_95_2DOF, camera_pose.CHI2_95_3DOF)
 
 
 def sigma_of(z: np.ndarray) -> np.ndarray:
@@ -182,9 +182,9 @@ def test_normal_equations_equal_numerical_derivatives():
     H, b, chi2 = np.zeros((6, 6)), np.zeros(6), np.empty(40)
     intrinsics = np.array([CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy])
     cost = pose_kernels.normal_equations(
-        T, x_w, xy, depth, 1 / sigma_px, 1 / sigma_z, np.ones(40, dtype=bool), intrinsics, *LIMITS, True, chi2, H, b
+        T, x_w, xy, depth, 1 / sigma_px, 1 / sigma_z, np.ones(40, dtype=bool), intrinsics, *HUBER, True, chi2, H, b
     )  # fmt: skip
-    one = (T[None], x_w, Observations(np.zeros(40, dtype=int), np.arange(40), xy, depth, sigma_px, sigma_z), CAMERA, LIMITS)
+    one = (T[None], x_w, Observations(np.zeros(40, dtype=int), np.arange(40), xy, depth, sigma_px, sigma_z), CAMERA, HUBER)
     H_slow, b_slow = naive.bundle_normal_equations(*one)
     np.testing.assert_allclose(cost, naive.bundle_cost(*one), rtol=1e-12)
     np.testing.assert_allclose(np.triu(H), np.triu(H_slow[:6, :6]), rtol=1e-5, atol=1e-5 * np.abs(H).max())
@@ -202,9 +202,7 @@ def test_the_error_is_what_the_information_says():
     chi2 = []
     for seed in range(200):
         T_cw, x_w, xy, depth, sigma_px, sigma_z, _ = view(np.random.default_rng(seed), 120)
-        found = camera_pose.refine_pose(
-            se3.exp(np.full(6, 0.01)) @ T_cw, x_w, xy, depth, sigma_px, sigma_z, CAMERA, chi2_px=30.0, chi2_depth=30.0
-        )
+        found = camera_pose.refine_pose(se3.exp(np.full(6, 0.01)) @ T_cw, x_w, xy, depth, sigma_px, sigma_z, CAMERA, loss=Huber(30.0, 30.0))
         xi = distance(found.T_cw, T_cw)
         chi2.append(xi @ found.information @ xi)
     assert 5.2 < np.mean(chi2) < 6.8  # chi2 of six degrees of freedom: 6 +- 0.25
@@ -233,8 +231,7 @@ def test_depth_makes_the_pose_surer():
 
 def test_without_the_kernel_it_is_least_squares():
     T_cw, x_w, xy, depth, sigma_px, sigma_z, _ = view(np.random.default_rng(20), 30)
-    everything = {"chi2_px": np.inf, "chi2_depth": np.inf, "rounds": 1}
-    found = camera_pose.refine_pose(T_cw, x_w, xy, depth, sigma_px, sigma_z, CAMERA, huber=False, **everything)
+    found = camera_pose.refine_pose(T_cw, x_w, xy, depth, sigma_px, sigma_z, CAMERA, loss=LEAST_SQUARES)
     one = (x_w, Observations(np.zeros(30, dtype=int), np.arange(30), xy, depth, sigma_px, sigma_z), CAMERA)
     best = naive.bundle_cost(found.T_cw[None], *one)
     np.testing.assert_allclose(found.cost, best, rtol=1e-9)
