@@ -48,7 +48,8 @@ def adjust(
     edges : relative poses of key frames that were measured besides
     tolerance : share of the cost; an iteration that lowers it by less ends the adjustment
 
-    Minimizes the sum of the loss over observations and edges, for observations of chi2 = |xy - pi(x)|^2 / sigma_px^2 + (depth - z)^2 / sigma_z^2.
+    Minimizes the sum of the loss over observations and edges; chi2 of an observation is
+    |xy - pi(x)|^2 / sigma_px^2 + (depth - z)^2 / sigma_z^2.
     A landmark seen once is adjusted with its depth; with one bearing alone it bears on nothing. Values that are not finite switch
     their observation off.
     """
@@ -104,7 +105,10 @@ def minimize(problem: Problem, *, max_iterations: int, tolerance: float) -> Mini
 
 
 class Damping:
-    """How far a step is drawn from Gauss-Newton's towards the gradient's; H. Nielsen, Damping Parameter in Marquardt's Method, IMM-REP-1999-05."""
+    """How far a step is drawn from Gauss-Newton's towards the gradient's.
+
+    H. Nielsen, Damping Parameter in Marquardt's Method, IMM-REP-1999-05.
+    """
 
     def __init__(self) -> None:
         self.value, self._growth = DAMPING_START, 2.0

@@ -165,7 +165,10 @@ class Problem:
         self._edge_terms.linearize(at.T_cw, self._loss.is_robust, self.normal.U, self.normal.b_c)
 
     def eliminate(self, damping: float, hold: np.ndarray) -> None:
-        """Fill the reduced camera system from them; damping multiplies their diagonal (Marquardt), `hold` (n,) is added to the key frames'."""
+        """Fill the reduced camera system from them.
+
+        damping : factor on their diagonal (Marquardt); hold : (n,) added to the key frames'
+        """
         self.system.blocks.fill(0.0)
         blocks = (*self.normal, self._obs_kf, self._offset, self.place)
         kernels.eliminate(*blocks, damping, hold, self.system.block_of, self.system.blocks, self.rhs, self.V_inv, self._scratch)
