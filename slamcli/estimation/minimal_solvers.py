@@ -5,6 +5,9 @@ import numpy as np
 from slamcli.geometry import elementary
 from slamcli.geometry.algebra import eigh, inverse, product
 
+LEAST_SINE = 1e-4  # between two edges of a triangle: below, its points lie on a line as far as single precision tells
+NEWTON_STEPS = 3  # each doubles the digits, and rounding leaves no more than a few wrong
+
 
 def p3p(x: np.ndarray, ray: np.ndarray) -> np.ndarray:
     """Find the poses that see three points along three rays.
@@ -75,7 +78,7 @@ def _real_root(b: np.ndarray, c: np.ndarray, d: np.ndarray) -> np.ndarray:
     radius = np.sqrt(np.maximum(-p / 3.0, 0.0))
     largest = 2.0 * radius * elementary.cos(elementary.arccos(np.clip(-0.5 * q / (radius * radius * radius), -1.0, 1.0)) / 3.0)
     root = np.where(discriminant > 0.0, one, largest) - b / 3.0
-    for _ in range(3):
+    for _ in range(NEWTON_STEPS):
         step = (((root + b) * root + c) * root + d) / ((3.0 * root + 2.0 * b) * root + c)
         root = np.where(np.isfinite(step), root - step, root)
     return root
@@ -85,7 +88,7 @@ def _polish(distances: np.ndarray, laws: np.ndarray) -> np.ndarray:
     """Take the rounding of all steps out of the distances (3, M, 4): Newton's method on the cosine laws."""
     b12, b13, b23, a12, a13, a23 = laws
     l0, l1, l2 = distances
-    for _ in range(3):
+    for _ in range(NEWTON_STEPS):
         r0 = l0 * l0 + l1 * l1 + b12 * l0 * l1 - a12
         r1 = l0 * l0 + l2 * l2 + b13 * l0 * l2 - a13
         r2 = l1 * l1 + l2 * l2 + b23 * l1 * l2 - a23
@@ -141,7 +144,7 @@ def _plane_frame(x: np.ndarray) -> np.ndarray:
     a, b = x[:, 1] - x[:, 0], x[:, 2] - x[:, 0]
     normal = np.cross(a, b)
     length, area = np.linalg.norm(a, axis=1), np.linalg.norm(normal, axis=1)
-    is_flat = area <= 1e-4 * length * np.linalg.norm(b, axis=1)
+    is_flat = area <= LEAST_SINE * length * np.linalg.norm(b, axis=1)
     with np.errstate(invalid="ignore", divide="ignore"):
         first, third = a / length[:, None], np.where(is_flat[:, None], np.nan, normal / area[:, None])
     return np.stack([first, np.cross(third, first), third], axis=-1)

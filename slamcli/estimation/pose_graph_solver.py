@@ -4,26 +4,27 @@ import numpy as np
 from scipy.sparse import coo_array, csr_array
 from scipy.sparse.linalg import SuperLU, splu
 
+from slamcli.estimation.relative_pose_factors import Edges
 from slamcli.geometry import se3
 from slamcli.geometry.algebra import product
 from slamcli.geometry.g2o_convention import to_g2o_information
 
 COLUMNS_AT_ONCE = 240  # of the covariance solved for
+CONVERGED = 1e-6  # share of the cost by which the last iteration changes it
+ROUNDING = 1e-9  # share of a cost or of a diagonal entry that the digits of g2o and of the factorization do not hold
+AS_GOOD_AS_FREE = 1e-6  # [1/m^2, 1/rad^2] a pose known to 1 km, 1000 rad
 
 
 class Graph:
     """The graph in g2o, with weights on its edges."""
 
-    def __init__(self, T_wk, edge_kf, edge_T_ij, information, is_fixed) -> None:
+    def __init__(self, T_wk: np.ndarray, edges: Edges, is_fixed: np.ndarray) -> None:
+        """Take the poses (K, 4, 4) to start from, and the key frames (K,) that stay; every edge weighs 1."""
         import g2opy
 
-        self.T_wk = np.array(T_wk, dtype=np.float64)
-        self.edge_kf = np.asarray(edge_kf, dtype=np.int64).reshape(-1, 2)
-        self.edge_T_ij = np.asarray(edge_T_ij, dtype=np.float64).reshape(-1, 4, 4)
-        self.information = np.asarray(information, dtype=np.float64).reshape(-1, 6, 6)
-        self.is_fixed = is_fixed
-        self._information_g2o = to_g2o_information(self.edge_T_ij, self.information)
-        self._weight = np.ones(len(self.edge_kf))
+        self.T_wk, self.edges, self.is_fixed = np.array(T_wk, dtype=np.float64), edges, is_fixed
+        self._information_g2o = to_g2o_information(edges.T_ij, edges.information)
+        self._weight = np.ones(len(edges))
         self._optimizer = g2opy.SparseOptimizer()
         self._vertices, self._edges = [], []
         for k, T in enumerate(self.T_wk):
@@ -33,7 +34,7 @@ class Graph:
             vertex.set_fixed(bool(is_fixed[k]))
             self._optimizer.add_vertex(vertex)
             self._vertices.append(vertex)
-        for (i, j), T, omega in zip(self.edge_kf.tolist(), self.edge_T_ij, self._information_g2o, strict=True):
+        for (i, j), T, omega in zip(edges.kf.tolist(), edges.T_ij, self._information_g2o, strict=True):
             edge = g2opy.EdgeSE3()
             edge.set_vertex(0, self._vertices[i])
             edge.set_vertex(1, self._vertices[j])
@@ -74,10 +75,10 @@ class Graph:
         self._optimizer.initialize_optimization()
         start = cost = self._cost()
         done, before = 0, np.inf
-        while done < iterations and abs(before - cost) > 1e-6 * cost:
+        while done < iterations and abs(before - cost) > CONVERGED * cost:
             done += 1
             before, cost = cost, self._cost() if self._optimizer.optimize(1) == 1 else np.inf
-        is_better = cost <= start * (1.0 + 1e-9) + 1e-9
+        is_better = cost <= start * (1.0 + ROUNDING) + ROUNDING
         if not is_better:
             self.restart(self.T_wk)
         return done, is_better
@@ -88,13 +89,13 @@ class Graph:
 
     def residual(self) -> np.ndarray:
         """Return e (E, 6) = log(T_iw T_wj T_ij^-1)."""
-        i, j = self.edge_kf.T
-        return se3.log(product(se3.inverse(self.T_wk[i]), self.T_wk[j], se3.inverse(self.edge_T_ij)))
+        i, j = self.edges.kf.T
+        return se3.log(product(se3.inverse(self.T_wk[i]), self.T_wk[j], se3.inverse(self.edges.T_ij)))
 
     def chi2(self) -> np.ndarray:
         """Return e^T Omega e (E,)."""
         e = self.residual()
-        return np.einsum("ei,eij,ej->e", e, self.information, e)
+        return np.einsum("ei,eij,ej->e", e, self.edges.information, e)
 
     def posterior(self, is_kept: np.ndarray) -> "Posterior":
         """Factorize the information that the edges kept give."""
@@ -108,11 +109,11 @@ class Posterior:
         # e = log(T_iw T_wj T_ij^-1). A left twist of T_iw adds to e as it is; one of T_jw adds minus Ad(T_iw T_wj) times itself. The
         # curvature of log is left out, as residuals are small.
         place = np.where(graph.is_fixed, -1, 6 * (np.cumsum(~graph.is_fixed) - 1))
-        i, j = graph.edge_kf.T
-        self._column = place[graph.edge_kf]
+        i, j = graph.edges.kf.T
+        self._column = place[graph.edges.kf]
         self._J = (np.broadcast_to(np.eye(6), (len(i), 6, 6)), -se3.adjoint(product(se3.inverse(graph.T_wk[i]), graph.T_wk[j])))
         self._n = 6 * int((~graph.is_fixed).sum())
-        self._factor = self._factorize(graph.information, is_kept)
+        self._factor = self._factorize(graph.edges.information, is_kept)
 
     def _factorize(self, information: np.ndarray, is_kept: np.ndarray) -> SuperLU:
         rows, columns, values = [], [], []
@@ -127,8 +128,8 @@ class Posterior:
                 values.append(block.ravel())
         entries = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
         H = coo_array(entries, shape=(self._n, self._n)).tocsc()
-        # Key frames that hang on nothing fixed would make it singular: 1 km, 1000 rad is as good as free.
-        H.setdiag(H.diagonal() * (1.0 + 1e-9) + 1e-6)
+        # Key frames that hang on nothing fixed would make it singular.
+        H.setdiag(H.diagonal() * (1.0 + ROUNDING) + AS_GOOD_AS_FREE)
         return splu(H, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
 
     def covariance(self, edges: np.ndarray) -> np.ndarray:

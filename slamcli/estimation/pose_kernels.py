@@ -14,7 +14,7 @@ from slamcli.jit.kernel import kernel
 
 Z_MIN = 1e-2  # [m] a landmark nearer to the image plane than this, or behind it, has no projection
 CHI2_BEHIND = 1e6  # what such an observation costs: more than any that can be seen, yet finite
-DAMPING_START, DAMPING_MIN, DAMPING_MAX = 1e-4, 1e-9, 1e6
+DAMPING_START, DAMPING_MIN, DAMPING_MAX = 1e-4, 1e-9, 1e6  # factor on the diagonal; beyond, no step lowers the cost
 
 
 @kernel(error_model="numpy")

@@ -10,6 +10,7 @@ from numba import float64 as f8
 
 from slamcli.jit.kernel import kernel
 
+DIAGONAL = 1e-40  # of the sum of all squares, that a matrix counts as diagonal with beside its diagonal
 MAX_SWEEPS = 30  # of Jacobi's method, which converges quadratically: 6 to 10 are needed
 
 
@@ -158,7 +159,7 @@ def jacobi(A, value, vector):
             value[:] = np.nan
             vector[:] = np.nan
             return
-        if outside <= 1e-40 * all_squares:
+        if outside <= DIAGONAL * all_squares:
             break
         for p in range(n - 1):
             for q in range(p + 1, n):

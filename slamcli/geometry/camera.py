@@ -19,6 +19,7 @@ LARGEST = 1e9  # of any of the numbers below: beyond, it is no camera and its sq
 MAX_INVERSE_DEPTH_OFFSET = 0.1  # [1/m]; a Kinect's is some thousandths
 POLYNOMIAL, EQUIDISTANT = "polynomial", "equidistant"  # values of Camera.lens
 LATER_FIELDS = {"k4": 0.0, "k5": 0.0, "k6": 0.0, "lens": POLYNOMIAL}  # written only where they say something
+ON_AXIS = 1e-9  # tangent of the angle from the axis within which a lens bends nothing
 LARGEST_SIDE = 16384  # [px]
 FOCAL_LENGTHS = (0.1, 20.0)  # shares of the width: 157 degrees across, and 3
 DEPTH_SCALES = (1.0, 1e6)  # units a metre
@@ -211,7 +212,7 @@ class Camera:
         theta = elementary.arctan2(r, 1.0)
         theta2 = theta * theta
         theta_d = theta * (1.0 + theta2 * (self.k1 + theta2 * (self.k2 + theta2 * (self.k3 + theta2 * self.k4))))
-        return np.where(r > 1e-9, theta_d / np.maximum(r, 1e-9), 1.0)
+        return np.where(r > ON_AXIS, theta_d / np.maximum(r, ON_AXIS), 1.0)
 
     def to_dict(self) -> dict:
         """Return the keys of `camera.json`; what only other lenses have is left out."""

@@ -4,6 +4,8 @@ import numpy as np
 
 from slamcli.jit.kernel import kernel
 
+SINGULAR = 1e-12  # of a diagonal entry, that must be left of it: the rest is the rounding of what was subtracted
+
 
 @kernel(error_model="numpy")
 def solve_damped(H, b, damping, L, out):
@@ -16,7 +18,7 @@ def solve_damped(H, b, damping, L, out):
             for k in range(j):
                 s -= L[i, k] * L[j, k]
             if i == j:
-                if not s > 1e-12 * H[j, j] or s == 0.0:
+                if not s > SINGULAR * H[j, j] or s == 0.0:
                     return False
                 L[j, j] = np.sqrt(s)
             else:

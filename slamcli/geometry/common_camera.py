@@ -10,6 +10,7 @@ from slamcli.geometry.camera import Camera
 from slamcli.geometry.depth_registration import Registration
 
 WIDEST = 1.5  # tangent of the angle from the axis up to which the common camera sees: 113 degrees across
+LEAST_SIDE = 1e-3  # tangent of the angle that it sees at least to every side: the principal point lies in the picture
 MOST_PIXELS = 1_100_000  # of the common camera, above which it is made coarser
 NOWHERE = -1e4  # [px] a place outside every picture
 BORDER_POINTS = 33  # along each side of a picture, whose directions tell what it sees
@@ -28,7 +29,7 @@ def common_camera(cameras: Sequence[Camera]) -> Camera:
     for camera in cameras:
         seen = np.clip(camera.normalize(_border(camera)), -WIDEST, WIDEST)
         low, high = np.minimum(low, seen.min(axis=0)), np.maximum(high, seen.max(axis=0))
-    low, high = np.minimum(low, -1e-3), np.maximum(high, 1e-3)  # the principal point lies in the picture
+    low, high = np.minimum(low, -LEAST_SIDE), np.maximum(high, LEAST_SIDE)
     focal = max(focal_length(camera) for camera in cameras)
     focal = min(focal, float(np.sqrt(MOST_PIXELS / np.prod(high - low))))
     width, height = (int(size) for size in np.ceil(focal * (high - low)))

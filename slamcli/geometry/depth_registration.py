@@ -8,7 +8,7 @@ import numpy as np
 from numba import f4, f8, i8
 
 from slamcli.geometry import elementary, se3
-from slamcli.geometry.camera import EQUIDISTANT, Camera
+from slamcli.geometry.camera import EQUIDISTANT, ON_AXIS, Camera
 from slamcli.jit.kernel import kernel
 
 OVERLAP = 1.1  # by which the footprints of neighbouring readings overlap, so that a slanted surface shows no holes
@@ -65,7 +65,7 @@ def bend(x, y, lens, k):
     r2 = x * x + y * y
     if lens == 2:
         r = math.sqrt(r2)
-        if r < 1e-9:
+        if r < ON_AXIS:
             return x, y
         t = elementary.arctangent2(r, 1.0)
         t2 = t * t

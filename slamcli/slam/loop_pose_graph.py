@@ -1,11 +1,13 @@
 """The pose graph of the key frames: built from the map and the closures, solved, and its result carried over to the map."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from slamcli.config.options import LoopConfig
 from slamcli.estimation import pose_graph
+from slamcli.estimation.relative_pose_factors import Edges
+from slamcli.estimation.repeated_edges import share_of_information
 from slamcli.geometry import se3
 from slamcli.geometry.algebra import product
 from slamcli.slam.loop_candidates import Candidate
@@ -24,9 +26,7 @@ MOST_SUPPORT = 300  # landmarks of a closure that count; more of them make it no
 class PoseGraph:
     """Edges between key frames."""
 
-    edge_kf: np.ndarray  # (E, 2) key frames (i, j)
-    edge_T_ij: np.ndarray  # (E, 4, 4), x_i = T_ij @ x_j
-    information: np.ndarray  # (E, 6, 6), twist order
+    edges: Edges  # where the map holds them, they repeat each other
     is_closure: np.ndarray  # (E,) bool
 
 
@@ -35,12 +35,12 @@ def build(sparse_map: SparseMap, closures: list[Candidate], settings: LoopConfig
     edge_kf, n_shared = covisibility_edges(sparse_map, settings)
     T_ij = product(se3.inverse(sparse_map.kf.T_wk[edge_kf[:, 0]]), sparse_map.kf.T_wk[edge_kf[:, 1]])
     support = np.append(n_shared, [float(min(c.n_inliers, MOST_SUPPORT)) for c in closures])
-    return PoseGraph(
-        edge_kf=np.concatenate([edge_kf, np.array([(c.kf_i, c.kf_j) for c in closures], dtype=np.int32).reshape(-1, 2)]),
-        edge_T_ij=np.concatenate([T_ij, np.array([c.T_ij for c in closures]).reshape(-1, 4, 4)]),
+    edges = Edges(
+        kf=np.concatenate([edge_kf, np.array([(c.kf_i, c.kf_j) for c in closures], dtype=np.int32).reshape(-1, 2)]),
+        T_ij=np.concatenate([T_ij, np.array([c.T_ij for c in closures]).reshape(-1, 4, 4)]),
         information=np.diag(1.0 / (ODOMETRY_SIGMA * ODOMETRY_SIGMA)) * (support / UNIT_SUPPORT)[:, None, None],
-        is_closure=np.arange(len(support)) >= len(edge_kf),
     )
+    return PoseGraph(edges, is_closure=np.arange(len(support)) >= len(edge_kf))
 
 
 def covisibility_edges(sparse_map: SparseMap, settings: LoopConfig) -> tuple[np.ndarray, np.ndarray]:
@@ -63,9 +63,9 @@ def solve(sparse_map: SparseMap, closures: list[Candidate], settings: LoopConfig
     graph = build(sparse_map, closures, settings)
     is_fixed = np.zeros(len(sparse_map.kf), dtype=bool)
     is_fixed[np.unique(sparse_map.kf.segment, return_index=True)[1]] = True
-    return pose_graph.optimize(
-        sparse_map.kf.T_wk, graph.edge_kf, graph.edge_T_ij, graph.information, is_fixed=is_fixed, is_robust=graph.is_closure
-    )
+    share = share_of_information(graph.edges, ~graph.is_closure)
+    edges = replace(graph.edges, information=graph.edges.information * share[:, None, None])
+    return pose_graph.optimize(sparse_map.kf.T_wk, edges, is_fixed=is_fixed, is_robust=graph.is_closure)
 
 
 def move(sparse_map: SparseMap, T_wk: np.ndarray) -> None:

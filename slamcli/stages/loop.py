@@ -135,4 +135,4 @@ def write_candidates(path: Path, candidates: list[Candidate]) -> None:
 
 def write_pose_graph(path: Path, T_wk: np.ndarray, graph: loop_pose_graph.PoseGraph) -> None:
     """Write the key frames, the edges between them as the final map has them, and the closures as they were measured."""
-    write_g2o(path, T_wk, graph.edge_kf, graph.edge_T_ij, graph.information)
+    write_g2o(path, T_wk, graph.edges.kf, graph.edges.T_ij, graph.edges.information)

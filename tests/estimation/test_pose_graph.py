@@ -1,5 +1,6 @@
 """The pose graph: laws, recovery, false edges, g2o's own arithmetic, files."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,8 @@ from hypothesis import strategies as st
 from slamcli.errors import SlamError
 from slamcli.estimation import pose_graph
 from slamcli.estimation.pose_graph_solver import Graph
+from slamcli.estimation.relative_pose_factors import NO_EDGES, Edges
+from slamcli.estimation.repeated_edges import share_of_information
 from slamcli.formats.g2o import read_g2o, write_g2o
 from slamcli.geometry import se3
 from slamcli.geometry.g2o_convention import from_g2o_information, to_g2o_information
@@ -63,7 +66,7 @@ def test_a_consistent_graph_stays_as_it_is():
     T, *_ = chain(0, 0)
     edges = np.array([(i, j) for i in range(N_KF) for j in range(max(0, i - 3), i)])
     information = np.tile(np.diag(SIGMA**-2.0), (len(edges), 1, 1))
-    result = pose_graph.optimize(T, edges, between(T, edges), information, is_fixed=FIRST)
+    result = pose_graph.optimize(T, Edges(edges, between(T, edges), information), is_fixed=FIRST)
     np.testing.assert_allclose(result.T_wk, T, atol=1e-9)
     assert result.cost < 1e-9 and result.is_kept.all()
 
@@ -71,18 +74,18 @@ def test_a_consistent_graph_stays_as_it_is():
 def test_where_the_world_stands_does_not_matter():
     _, T, edges, measured, information = chain(1, 5)
     G = se3.exp(np.array([1.0, 2.0, -1.0, 0.5, -1.0, 0.3]))
-    a = pose_graph.optimize(T, edges, measured, information, is_fixed=FIRST)
-    b = pose_graph.optimize(G @ T, edges, measured, information, is_fixed=FIRST)
+    a = pose_graph.optimize(T, Edges(edges, measured, information), is_fixed=FIRST)
+    b = pose_graph.optimize(G @ T, Edges(edges, measured, information), is_fixed=FIRST)
     np.testing.assert_allclose(b.T_wk, G @ a.T_wk, atol=1e-7)
 
 
 def test_fixed_key_frames_stay_and_one_must_be_fixed():
     _, T, edges, measured, information = chain(2, 4)
     is_fixed = np.isin(np.arange(N_KF), [0, 40, 79])
-    result = pose_graph.optimize(T, edges, measured, information, is_fixed=is_fixed)
+    result = pose_graph.optimize(T, Edges(edges, measured, information), is_fixed=is_fixed)
     np.testing.assert_allclose(result.T_wk[is_fixed], T[is_fixed], atol=1e-12)
     with pytest.raises(ValueError, match="fixed"):
-        pose_graph.optimize(T, edges, measured, information, is_fixed=np.zeros(N_KF, dtype=bool))
+        pose_graph.optimize(T, Edges(edges, measured, information), is_fixed=np.zeros(N_KF, dtype=bool))
 
 
 def test_same_input_same_bytes():
@@ -90,13 +93,13 @@ def test_same_input_same_bytes():
     _, T, edges, measured, information = chain(3, 6)
     measured[-1] = se3.exp(rng.normal(size=6)) @ measured[-1]
     robust = np.arange(len(edges)) >= N_KF - 1
-    a, b = (pose_graph.optimize(T, edges, measured, information, is_fixed=FIRST, is_robust=robust) for _ in range(2))
+    a, b = (pose_graph.optimize(T, Edges(edges, measured, information), is_fixed=FIRST, is_robust=robust) for _ in range(2))
     assert a.T_wk.tobytes() == b.T_wk.tobytes()
 
 
 def test_no_edges_and_no_robust_edges():
     T = laps(5)
-    nothing = pose_graph.optimize(T, np.zeros((0, 2), int), np.zeros((0, 4, 4)), np.zeros((0, 6, 6)), is_fixed=np.arange(5) == 0)
+    nothing = pose_graph.optimize(T, NO_EDGES, is_fixed=np.arange(5) == 0)
     assert (nothing.T_wk == T).all() and len(nothing.chi2) == 0 and nothing.cost == 0.0
 
 
@@ -104,7 +107,7 @@ def test_a_part_that_hangs_on_nothing_stays():
     _, T, edges, measured, information = chain(4, 3)
     cut = (edges.max(axis=1) < 60) | (edges.min(axis=1) >= 60)  # key frames from 60 on are cut off
     robust = (np.arange(len(edges)) >= N_KF - 1)[cut]
-    result = pose_graph.optimize(T, edges[cut], measured[cut], information[cut], is_fixed=FIRST, is_robust=robust)
+    result = pose_graph.optimize(T, Edges(edges[cut], measured[cut], information[cut]), is_fixed=FIRST, is_robust=robust)
     assert np.isfinite(result.T_wk).all()
     np.testing.assert_allclose(result.T_wk[60:], T[60:], atol=1e-6)
 
@@ -116,9 +119,9 @@ def test_errors_and_cost_are_what_the_information_says():
     cost, chi2 = [], []
     for seed in range(25):
         T_true, T, edges, measured, information = chain(seed, 10)
-        result = pose_graph.optimize(T, edges, measured, information, is_fixed=FIRST)
+        result = pose_graph.optimize(T, Edges(edges, measured, information), is_fixed=FIRST)
         cost.append(result.cost / (6 * 10))  # degrees of freedom: six per edge beyond the tree
-        graph = Graph(result.T_wk, edges, measured, information, FIRST)
+        graph = Graph(result.T_wk, Edges(edges, measured, information), FIRST)
         pair = np.array([len(edges) - 1])
         e = graph.residual()[pair].ravel() - se3.log(between(T_true, edges[pair]) @ se3.inverse(measured[pair])).ravel()
         chi2.append(e @ np.linalg.solve(graph.posterior(np.ones(len(edges), dtype=bool)).covariance(pair), e))
@@ -128,7 +131,7 @@ def test_errors_and_cost_are_what_the_information_says():
 
 def test_closures_take_the_drift_out():
     T_true, T, edges, measured, information = chain(5, 8)
-    result = pose_graph.optimize(T, edges, measured, information, is_fixed=FIRST)
+    result = pose_graph.optimize(T, Edges(edges, measured, information), is_fixed=FIRST)
     assert 0.001 < ape(result.T_wk, T_true) < 0.5 * ape(T, T_true)
 
 
@@ -139,11 +142,11 @@ def test_a_planted_false_edge_changes_nothing(seed, true):
     T_true, T, edges, measured, information = chain(seed, true)
     i, j = sorted(rng.choice(N_KF, 2, replace=False))
     false = se3.exp(rng.normal(size=6) * [0.7, 0.3, 0.7, 0.3, 0.5, 0.3]) @ between(T_true, np.array([[j, i]]))
-    clean = pose_graph.optimize(T, edges, measured, information, is_fixed=FIRST)
+    clean = pose_graph.optimize(T, Edges(edges, measured, information), is_fixed=FIRST)
     edges, measured = np.vstack([edges, [[j, i]]]), np.concatenate([measured, false])
     information = np.concatenate([information, information[:1]])
     robust = np.arange(len(edges)) >= N_KF - 1
-    found = pose_graph.optimize(T, edges, measured, information, is_fixed=FIRST, is_robust=robust)
+    found = pose_graph.optimize(T, Edges(edges, measured, information), is_fixed=FIRST, is_robust=robust)
     assert found.is_kept[:-1].all() and not found.is_kept[-1]
     assert found.chi2[-1] > pose_graph.CHI2_99_6DOF
     assert abs(ape(found.T_wk, T_true) / ape(clean.T_wk, T_true) - 1.0) < 0.01
@@ -155,9 +158,9 @@ def test_a_lone_false_edge_is_seen_though_its_own_residual_vanishes():
     false = se3.exp(np.array([0.4, 0.0, 0.0, 0.0, 0.0, 0.0])) @ between(T_true, np.array([[70, 5]]))
     edges, measured = np.vstack([edges, [[70, 5]]]), np.concatenate([measured, false])
     information = np.concatenate([information, information[:1]])
-    bent = pose_graph.optimize(T, edges, measured, information, is_fixed=FIRST)
+    bent = pose_graph.optimize(T, Edges(edges, measured, information), is_fixed=FIRST)
     robust = np.arange(len(edges)) == len(edges) - 1
-    found = pose_graph.optimize(T, edges, measured, information, is_fixed=FIRST, is_robust=robust)
+    found = pose_graph.optimize(T, Edges(edges, measured, information), is_fixed=FIRST, is_robust=robust)
     assert bent.chi2[-1] < pose_graph.CHI2_99_6DOF < found.chi2[-1]
     assert not found.is_kept[-1]
     np.testing.assert_allclose(found.T_wk, T, atol=1e-6)
@@ -166,14 +169,14 @@ def test_a_lone_false_edge_is_seen_though_its_own_residual_vanishes():
 def test_a_group_of_false_edges_that_agree_with_each_other():
     rng = np.random.default_rng(7)
     T_true, T, edges, measured, information = chain(7, 8)
-    clean = pose_graph.optimize(T, edges, measured, information, is_fixed=FIRST)
+    clean = pose_graph.optimize(T, Edges(edges, measured, information), is_fixed=FIRST)
     false = np.array([[60, 20], [61, 21], [62, 21]])
     E = se3.exp(np.array([0.8, 0.0, -0.6, 0.0, 0.4, 0.0]))
     wrong = se3.exp(0.2 * rng.normal(size=(3, 6)) * SIGMA) @ E @ between(T_true, false)
     edges, measured = np.vstack([edges, false]), np.concatenate([measured, wrong])
     information = np.concatenate([information, information[:3]])
     robust = np.arange(len(edges)) >= N_KF - 1
-    found = pose_graph.optimize(T, edges, measured, information, is_fixed=FIRST, is_robust=robust)
+    found = pose_graph.optimize(T, Edges(edges, measured, information), is_fixed=FIRST, is_robust=robust)
     assert found.is_kept[:-3].all() and not found.is_kept[-3:].any()
     np.testing.assert_allclose(ape(found.T_wk, T_true), ape(clean.T_wk, T_true), rtol=0.01)
 
@@ -193,10 +196,10 @@ def test_many_false_edges_by_metres_and_half_turns_do_not_take_the_true_ones_wit
     measured = np.concatenate([measured, se3.exp(twist) @ between(T_true, ends)])
     information = np.concatenate([information, np.tile(information[:1], (len(ends), 1, 1))])
     is_robust = np.arange(len(edges)) >= N_KF - 1
-    result = pose_graph.optimize(T, edges, measured, information, is_fixed=FIRST, is_robust=is_robust)
+    result = pose_graph.optimize(T, Edges(edges, measured, information), is_fixed=FIRST, is_robust=is_robust)
     np.testing.assert_array_equal(result.is_kept[is_robust], np.arange(3 + len(ends)) < 3)
     alone = slice(0, N_KF + 2)
-    without = pose_graph.optimize(T, edges[alone], measured[alone], information[alone], is_fixed=FIRST, is_robust=is_robust[alone])
+    without = pose_graph.optimize(T, Edges(edges[alone], measured[alone], information[alone]), is_fixed=FIRST, is_robust=is_robust[alone])
     np.testing.assert_allclose(result.T_wk, without.T_wk, atol=1e-4)
 
 
@@ -216,27 +219,30 @@ def test_edges_that_repeat_each_other_do_not_stiffen_the_chain():
     measured[-1] = se3.exp(np.array([0.5, 0, 0.5, 0, 0.3, 0])) @ measured[-1]
     information = np.tile(np.diag(SIGMA**-2.0), (len(edges), 1, 1))
     robust = np.arange(len(edges)) >= len(chain_edges)
-    found, stiff = (
-        pose_graph.optimize(T, edges, measured, information, is_fixed=FIRST, is_robust=robust, is_independent=i) for i in (False, True)
-    )
+    taken = Edges(edges, measured, information)
+    shared = replace(taken, information=information * share_of_information(taken, ~robust)[:, None, None])
+    found, stiff = (pose_graph.optimize(T, e, is_fixed=FIRST, is_robust=robust) for e in (shared, taken))
     assert ape(T, T_true) > 0.12
     assert found.is_kept[:-1].all() and not found.is_kept[-1]
     assert 0.01 < ape(found.T_wk, T_true) < 0.6 * ape(T, T_true)
     assert not stiff.is_kept[-7:].any()  # what would happen otherwise
 
 
+def edges_of(kf: np.ndarray) -> Edges:
+    return Edges(kf, np.tile(np.eye(4), (len(kf), 1, 1)), np.tile(np.eye(6), (len(kf), 1, 1)))
+
+
 def test_the_share_of_parallel_edges():
     single = np.array([(k + 1, k) for k in range(20)])
     trusted = np.ones(20, dtype=bool)
-    np.testing.assert_allclose(pose_graph.share_of_information(single, np.tile(np.eye(6), (20, 1, 1)), trusted), 1.0)
+    np.testing.assert_allclose(share_of_information(edges_of(single), trusted), 1.0)
     edges = np.array([(i, i - s) for i in range(60) for s in (1, 2, 3) if i >= s])
-    share = pose_graph.share_of_information(edges, np.tile(np.eye(6), (len(edges), 1, 1)), np.ones(len(edges), dtype=bool))
+    share = share_of_information(edges_of(edges), np.ones(len(edges), dtype=bool))
     inner = (edges.min(axis=1) > 5) & (edges.max(axis=1) < 54)
     np.testing.assert_allclose(share[inner], 1.0 / (1 + 4 + 9))
     far = np.vstack([edges, [[55, 3]]])
-    information = np.tile(np.eye(6), (len(far), 1, 1))
-    np.testing.assert_allclose(pose_graph.share_of_information(far, information, np.arange(len(far)) < len(edges))[-1], 1.0)
-    assert pose_graph.share_of_information(far, information, np.ones(len(far), dtype=bool))[-1] < 0.1
+    np.testing.assert_allclose(share_of_information(edges_of(far), np.arange(len(far)) < len(edges))[-1], 1.0)
+    assert share_of_information(edges_of(far), np.ones(len(far), dtype=bool))[-1] < 0.1
 
 
 # --- g2o's arithmetic
@@ -252,7 +258,7 @@ def test_the_cost_is_g2os_to_first_order():
     T = laps(6)
     edges = np.array([[0, 1], [1, 2], [4, 2], [5, 0]])
     measured = se3.exp(1e-4 * rng.normal(size=(4, 6))) @ between(T, edges)
-    graph = Graph(T, edges, measured, random_information(rng, 4), np.arange(6) == 0)
+    graph = Graph(T, Edges(edges, measured, random_information(rng, 4)), np.arange(6) == 0)
     for edge in graph._edges:
         edge.compute_error()
     np.testing.assert_allclose([edge.chi2() for edge in graph._edges], graph.chi2(), rtol=2e-4)
@@ -264,7 +270,7 @@ def test_derivatives_of_the_residual():
     edges = np.array([[0, 1], [3, 1], [2, 3]])
     measured = between(T, edges)  # at zero residual, where the curvature left out vanishes
     is_fixed = np.arange(4) == 0
-    graph = Graph(T, edges, measured, random_information(rng, 3), is_fixed)
+    graph = Graph(T, Edges(edges, measured, random_information(rng, 3)), is_fixed)
     posterior = graph.posterior(np.ones(3, dtype=bool))
     h = 1e-6
     for k in range(4):
@@ -325,7 +331,7 @@ def test_g2o_reads_our_file_and_finds_the_same_cost(tmp_path: Path):
     assert optimizer.vertices()[0].fixed() and not optimizer.vertices()[3].fixed()
     optimizer.initialize_optimization()
     optimizer.compute_active_errors()
-    ours = Graph(T, edges, measured, information, np.arange(7) == 0).chi2().sum()
+    ours = Graph(T, Edges(edges, measured, information), np.arange(7) == 0).chi2().sum()
     np.testing.assert_allclose(optimizer.active_chi2(), ours, rtol=2e-2)
     assert optimizer.save(str(tmp_path / "b.g2o"))
     again = read_g2o(tmp_path / "b.g2o")
