@@ -2,106 +2,253 @@
 """Change the code in small ways and see whether the tests notice; what survives shows where they are blind.
 
     pip install cosmic-ray
-    python scripts/mutations.py [MODULE ...] [--share 0.1] [--seed 0] [--timeout 180]
+    python scripts/mutations.py [MODULE ...] [--number 40] [--seed 0] [--only K ...]
 
-Modules are those of TESTS below. A copy of the checkout is mutated, never the checkout itself. Of all mutants of a module a share is
-drawn; each runs the module's tests, which end at the first failure. Survivors are printed as diffs. Kernels are compiled anew where
-their file is mutated, so a mutant takes 5 to 40 s.
+Modules are those of TESTS below. A copy of the checkout is mutated, never the checkout itself. Of a module's mutants, made by
+cosmic-ray's operators, some are drawn, at as many places of it as can be. Each runs the module's tests, the quickest first, up to the
+first that fails, in a process forked from one that has imported all that does not depend on the module: half a second where a test
+soon notices. Survivors are printed as diffs. Their tests need a Unix system.
 """
 
 import argparse
+import ast
+import difflib
+import functools
+import importlib
+import itertools
 import os
+import pkgutil
 import random
+import resource
 import shutil
-import subprocess
+import signal
 import sys
 import tempfile
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
-# The tests that are about a module, quickest first.
-TESTS = {
+TRACKING = ["slam/test_tracker.py", "slam/test_depth_tracking.py", "options/test_tracking_options.py"]
+LOOPS = ["slam/test_loop_closing.py", "options/test_loop_options.py"]
+TESTS = {  # that are about a module
     "slam/key_frames": ["slam/test_key_frames.py"],
-    "slam/tracker": ["slam/test_tracker.py", "slam/test_depth_tracking.py"],
-    "slam/localizer": ["slam/test_tracker.py", "slam/test_depth_tracking.py"],
-    "slam/map_growth": ["slam/test_map_growth.py"],
-    "slam/loop_candidates": ["slam/test_loop_closing.py"],
-    "slam/loop_verification": ["slam/test_loop_closing.py"],
-    "slam/loop_pose_graph": ["slam/test_loop_closing.py", "slam/test_depth_tracking.py"],
-    "slam/loop_closing": ["slam/test_loop_closing.py", "slam/test_map_segments.py"],
-    "slam/map_merging": ["slam/test_map_segments.py"],
-    "navigation/grid": ["navigation/test_grid.py", "navigation/test_grid_hazards.py"],
+    "slam/tracker": [*TRACKING, "slam/test_map_segments.py", "slam/test_rests.py"],
+    "slam/localizer": [*TRACKING, "slam/test_map_segments.py"],
+    "slam/map_growth": ["slam/test_map_growth.py", "slam/test_tracker.py", "options/test_tracking_options.py"],
+    "slam/loop_candidates": ["slam/test_loop_candidates.py", *LOOPS],
+    "slam/loop_verification": LOOPS,
+    "slam/loop_pose_graph": ["slam/test_loop_pose_graph.py", "slam/test_loop_closing.py"],
+    "slam/loop_closing": ["slam/test_loop_rounds.py", "slam/test_loop_closing.py", "slam/test_map_segments.py"],
+    "slam/map_merging": ["slam/test_map_segments.py", "options/test_loop_options.py"],
+    "navigation/grid": ["navigation/test_grid_fusion.py", "navigation/test_grid.py", "navigation/test_grid_hazards.py"],
     "navigation/planner": ["navigation/test_planner.py"],
 }
-CONFIG = """
-[cosmic-ray]
-module-path = "slamcli/{module}.py"
-timeout = {timeout}
-excluded-modules = []
-test-command = "{python} -m pytest -x -q -n 0 -p no:cacheprovider {tests}"
+SLOWER = 6.0  # times as long as unchanged code, beyond COMPILING, may a mutant take; then it counts as noticed
+COMPILING = 60.0  # [s]
 
-[cosmic-ray.distributor]
-name = "local"
-"""
-# Nothing runs differently without a type, and a decorator taken off a kernel leaves the same function, only slower.
-DULL_OPERATORS = ("core/ReplaceBinaryOperator_BitOr_", "core/RemoveDecorator")
+
+@dataclass(frozen=True)
+class Mutant:
+    """A module's source, changed in one place."""
+
+    source: str
+    line: int  # from 1
+    place: tuple  # start and end of what was changed
 
 
 def main() -> None:
-    """Run a share of the mutants of some modules and print the survivors."""
+    """Run some mutants of some modules and print the survivors."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("modules", nargs="*", default=list(TESTS), metavar="MODULE")
-    parser.add_argument("--share", type=float, default=0.1, help="of the mutants that are run")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--timeout", type=float, default=180.0, help="[s] after which a mutant counts as noticed")
+    parser.add_argument("--number", type=int, default=40, help="of mutants that are run of each module [40]")
+    parser.add_argument("--only", type=int, nargs="+", metavar="K", help="run these again: their numbers, printed with the survivors")
+    parser.add_argument("--seed", type=int, default=0, help="of the draw [0]")
+    parser.add_argument("--folder", type=Path, help="of the copy, kept: the next run finds its kernels compiled [a temporary one]")
     arguments = parser.parse_args()
     if unknown := set(arguments.modules) - set(TESTS):
         parser.error(f"no tests are named for {', '.join(sorted(unknown))}; known: {', '.join(TESTS)}")
-    killed = total = 0
     with tempfile.TemporaryDirectory() as folder:
-        copy = Path(folder) / ROOT.name
-        shutil.copytree(ROOT, copy, ignore=shutil.ignore_patterns(".git", "runs", "__pycache__", ".venv", "site"))
+        copy = (arguments.folder or Path(folder)) / ROOT.name
+        ignored = shutil.ignore_patterns(".git", "runs", "__pycache__", ".venv", "site")
+        shutil.copytree(ROOT, copy, ignore=ignored, dirs_exist_ok=True)
         for module in arguments.modules:
-            survivors, n = mutate(copy, module, share=arguments.share, rng=random.Random(arguments.seed), timeout=arguments.timeout)
-            print(f"{module}: {n - len(survivors)} of {n} mutants noticed", flush=True)
-            for diff in survivors:
-                print(diff, flush=True)
-            killed, total = killed + n - len(survivors), total + n
-    print(f"{killed} of {total} mutants noticed")
+            # A process of its own, as what is imported depends on the module.
+            in_fork(lambda module=module: try_module(copy, module, arguments), log=None)
 
 
-def mutate(copy: Path, module: str, *, share: float, rng: random.Random, timeout: float) -> tuple[list[str], int]:
-    """Run a share of a module's mutants; returns the diffs of those that no test noticed, and how many ran."""
-    from cosmic_ray.work_db import WorkDB, use_db
-    from cosmic_ray.work_item import TestOutcome
+def try_module(copy: Path, module: str, arguments: argparse.Namespace) -> None:
+    """Run mutants of one module; print how many the tests noticed, and the diffs of the others."""
+    os.chdir(copy)
+    sys.dont_write_bytecode = True  # of one mutant it could be read for the next
+    sys.path[:0] = [str(copy), str(copy / "tests")]
+    file = copy / f"slamcli/{module}.py"
+    original = (ROOT / f"slamcli/{module}.py").read_text()
+    import_all_but(f"slamcli.{module.replace('/', '.')}")
+    order, log = copy / "order.txt", copy / "log.txt"
+    started = time.monotonic()
+    if not in_fork(lambda: run_tests([f"tests/{name}" for name in TESTS[module]], order), log=log):
+        sys.exit(f"{module}: the tests fail without any mutation: see {log}" if arguments.folder else log.read_text())
+    timeout = COMPILING + SLOWER * (time.monotonic() - started)
+    drawn = draw(original, random.Random(arguments.seed))
+    numbers = arguments.only or range(min(arguments.number, len(drawn)))
+    survivors = 0
+    for number in numbers:
+        mutant = drawn[number]
+        file.write_text(mutant.source)
+        try:
+            survived = in_fork(functools.partial(run_mutant, mutant, original, order), log=log, timeout=timeout)
+        finally:
+            file.write_text(original)
+        if survived:
+            survivors += 1
+            diff = difflib.unified_diff(original.splitlines(), mutant.source.splitlines(), module, module, n=0, lineterm="")
+            print("\n".join([f"{number}:", *itertools.islice(diff, 2, None)]), flush=True)
+    spent = resource.getrusage(resource.RUSAGE_CHILDREN)
+    seconds = (spent.ru_utime + spent.ru_stime) / len(numbers)
+    print(f"{module}: {len(numbers) - survivors} of {len(numbers)} mutants noticed, {seconds:.1f} s of CPU time each", flush=True)
 
-    tests = " ".join(f"tests/{name}" for name in TESTS[module])
-    (copy / "mutants.toml").write_text(CONFIG.format(module=module, timeout=timeout, python=sys.executable, tests=tests))
-    database = copy / "mutants.sqlite"
-    database.unlink(missing_ok=True)
-    cosmic_ray(copy, "baseline", "mutants.toml")
-    cosmic_ray(copy, "init", "mutants.toml", "mutants.sqlite")
-    with use_db(str(database), WorkDB.Mode.open) as work:
-        items = sorted(
-            (i for i in work.work_items if not i.mutations[0].operator_name.startswith(DULL_OPERATORS)),
-            key=lambda i: i.mutations[0].start_pos,
-        )
-        chosen = rng.sample(items, max(1, round(share * len(items))))
-        work.clear()
-        work.add_work_items(chosen)
-    cosmic_ray(copy, "exec", "mutants.toml", "mutants.sqlite")
-    with use_db(str(database), WorkDB.Mode.open) as work:
-        results = [result for _, result in work.results]
-    return [str(result.diff) for result in results if result.test_outcome == TestOutcome.SURVIVED], len(results)
+
+def draw(source: str, rng: random.Random) -> list[Mutant]:
+    """Shuffle all mutants so that each place is changed once before any is changed twice."""
+    mutants = list(all_mutants(source))
+    rng.shuffle(mutants)
+    seen: dict[tuple, int] = {}
+    turn = []
+    for mutant in mutants:
+        turn.append(seen.get(mutant.place, 0))
+        seen[mutant.place] = turn[-1] + 1
+    return [mutants[k] for k in sorted(range(len(mutants)), key=lambda k: turn[k])]
 
 
-def cosmic_ray(copy: Path, *arguments: str) -> None:
-    """Run cosmic-ray in the copy, whose package and tests are imported."""
-    command = [sys.executable, "-m", "cosmic_ray.cli", *arguments]
-    path = {"PYTHONPATH": f"{copy}:{copy / 'tests'}"}
-    done = subprocess.run(command, cwd=copy, env={**os.environ, **path}, capture_output=True, text=True)
-    if done.returncode:
-        sys.exit(f"cosmic-ray {arguments[0]} failed: {done.stdout[-2000:]}{done.stderr[-2000:]}")
+def all_mutants(source: str) -> Iterator[Mutant]:
+    """Yield the mutants of a source, but for those that cannot behave differently."""
+    import cosmic_ray.plugins
+    from cosmic_ray.ast import ast_nodes, get_ast
+    from cosmic_ray.mutating import mutate_code
+
+    dull, signatures = where_types_stand(source), where_arguments_stand(source)
+    for name in cosmic_ray.plugins.operator_names():
+        kind = cosmic_ray.plugins.get_operator(name)
+        if kind.arguments() or name == "core/RemoveDecorator":
+            continue
+        nodes = ast_nodes(get_ast(source))
+        for k, place in enumerate(position for node in nodes for position in kind().mutation_positions(node)):
+            skipped = dull + signatures if "BinaryOperator" in name else dull
+            if any(a <= place[0] < b for a, b in skipped):
+                continue
+            mutated = mutate_code(source, kind(), k)
+            if mutated is not None and mutated != source:
+                yield Mutant(mutated, place[0][0], place)
+
+
+def where_arguments_stand(source: str) -> list[tuple[tuple[int, int], tuple[int, int]]]:
+    """List where functions name their arguments: the star before those given by keyword is no product."""
+    functions = [n for n in ast.walk(ast.parse(source)) if isinstance(n, ast.FunctionDef)]
+    return [((n.lineno, n.col_offset), (n.body[0].lineno, n.body[0].col_offset)) for n in functions]
+
+
+def where_types_stand(source: str) -> list[tuple[tuple[int, int], tuple[int, int]]]:
+    """List where annotations and decorators stand: nothing runs differently without a type, nor with records that can be changed."""
+    nodes: list[ast.AST | None] = []
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.arg | ast.AnnAssign):
+            nodes.append(node.annotation)
+        elif isinstance(node, ast.FunctionDef):
+            nodes += [node.returns, *node.decorator_list]
+        elif isinstance(node, ast.ClassDef):
+            nodes += node.decorator_list
+    return [((n.lineno, n.col_offset), (n.end_lineno, n.end_col_offset)) for n in nodes if n is not None]  # type: ignore[attr-defined]
+
+
+def import_all_but(module: str) -> None:
+    """Import every module of the package that can do without `module`, and load the machine code of its kernels."""
+    import slamcli
+    from slamcli.jit import cache, compilation
+    from slamcli.jit.kernel import DECLARED, argument_types
+
+    for name in ("_pytest.config", "pytest", "hypothesis", "click.testing", "scipy.ndimage", "cv2"):
+        importlib.import_module(name)
+    compilation.ensure()
+    compilation.ensure = lambda **_: None  # tests would look through all kernels again
+    sys.modules[module] = None  # type: ignore[assignment]  # an import of it fails, and so does what needs it
+    for found in pkgutil.walk_packages(slamcli.__path__, "slamcli."):
+        if not found.name.endswith("__main__"):
+            try:
+                importlib.import_module(found.name)
+            except ImportError:
+                continue
+    del sys.modules[module]
+    for compiled in DECLARED:
+        compiled.compile(argument_types(compiled))
+    cache._digest(str(Path(f"{module.replace('.', '/')}.py").absolute()))  # mutants outside kernels find these compiled
+
+
+def run_mutant(mutant: Mutant, original: str, order: Path) -> None:
+    """Run the tests of a mutant whose file is in place, in the order noted."""
+    from slamcli.jit import cache
+
+    if is_in_kernel(original, mutant.line):
+        cache._digest.cache_clear()
+        cache.KernelCache.save_overload = lambda *_: None  # type: ignore[method-assign]
+    run_tests(order.read_text().splitlines())
+
+
+def is_in_kernel(source: str, line: int) -> bool:
+    """Say whether a line is one that numba compiles, or a constant outside of functions, which it compiles in."""
+    functions = [n for n in ast.walk(ast.parse(source)) if isinstance(n, ast.FunctionDef)]
+    around = [n for n in functions if n.lineno <= line <= (n.end_lineno or line)]
+    return not around or any("kernel" in ast.unparse(d) for n in around for d in n.decorator_list)
+
+
+class Stopwatch:
+    """Notes how long each test takes."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+
+    def pytest_runtest_logreport(self, report) -> None:  # pytest's own record
+        """Add up a test's set-up and call."""
+        self.seconds[report.nodeid] = self.seconds.get(report.nodeid, 0.0) + report.duration
+
+
+def run_tests(names: list[str], order: Path | None = None) -> None:
+    """Run tests up to the first that fails and end the process with pytest's status; note their names in `order`, the quickest first."""
+    import pytest
+
+    watch = Stopwatch()
+    os.environ["PYTEST_DISABLE_PLUGIN_AUTOLOAD"] = "1"
+    status = pytest.main(["-x", "-q", "-o", "addopts=", "-p", "no:cacheprovider", *names], plugins=[watch])
+    if order is not None:
+        order.write_text("\n".join(sorted(watch.seconds, key=watch.seconds.__getitem__)))
+    os._exit(int(status))
+
+
+def in_fork(task: Callable[[], None], *, log: Path | None, timeout: float = 1e6) -> bool:
+    """Run a task in a child process; say whether it ended well, and in time [s]. Its output goes to `log`."""
+    sys.stdout.flush()
+    child = os.fork()
+    if child == 0:
+        try:
+            os.setsid() if log is not None else None
+            if log is not None:
+                output = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+                os.dup2(output, 1), os.dup2(output, 2)
+            task()
+            sys.stdout.flush()
+        except BaseException as error:
+            print(f"{type(error).__name__}: {error}", flush=True)
+            os._exit(1)
+        os._exit(0)
+    end = time.monotonic() + timeout
+    while time.monotonic() < end:
+        if (done := os.waitpid(child, os.WNOHANG))[0]:
+            return os.waitstatus_to_exitcode(done[1]) == 0
+        time.sleep(0.02)
+    os.killpg(child, signal.SIGKILL)
+    os.waitpid(child, 0)
+    return False
 
 
 if __name__ == "__main__":
