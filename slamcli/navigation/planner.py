@@ -178,7 +178,7 @@ def _a_star(cost, start, goal, before):
                 r2, c2 = r + dr, c + dc
                 if r2 < 0 or c2 < 0 or r2 >= rows or c2 >= columns:
                     continue
-                if cost[r2, c2] == np.inf or cost[r, c2] == np.inf or cost[r2, c] == np.inf:
+                if cost[r, c2] == np.inf or cost[r2, c] == np.inf:
                     continue
                 to = r2 * columns + c2
                 total = so_far[at] + (diagonal if dr * dc != 0 else 1.0) * 0.5 * (cost[r, c] + cost[r2, c2])
