@@ -5,6 +5,8 @@ import itertools
 import naive
 import numpy as np
 import pytest
+from scipy import sparse
+from scipy.sparse import csgraph
 
 from slamcli.errors import SlamError
 from slamcli.navigation import planner, tight_path
@@ -41,6 +43,11 @@ def test_the_path_goes_round_a_wall_and_keeps_its_distance():
     assert route.clearance.min() >= 0.0
 
 
+def steps_cost(cost, cells):
+    """Add up what the steps from cell to cell cost."""
+    return sum(np.hypot(*(np.array(b) - a)) * 0.5 * (cost[tuple(a)] + cost[tuple(b)]) for a, b in itertools.pairwise(cells.tolist()))
+
+
 def test_the_cells_are_the_cheapest_there_are():
     rng = np.random.default_rng(1)
     for _ in range(12):
@@ -53,9 +60,26 @@ def test_the_cells_are_the_cheapest_there_are():
         if cells is None:
             assert expected == np.inf
             continue
-        steps = sum(np.hypot(*(np.array(b) - a)) * 0.5 * (cost[tuple(a)] + cost[tuple(b)]) for a, b in itertools.pairwise(cells.tolist()))
-        assert steps == pytest.approx(expected)
+        assert steps_cost(cost, cells) == pytest.approx(expected)
         assert np.abs(np.diff(cells, axis=0)).max() == 1
+
+
+def test_among_many_open_cells_the_path_is_the_cheapest_too():
+    """Far more cells wait at once than the first room of the list of open cells holds."""
+    rng = np.random.default_rng(4)
+    shape, cost = (200, 200), 1.0 + 200.0 * rng.random((200, 200)) ** 8
+    cells = planner._cheapest(cost, (100, 100), (199, 0))
+    number = np.arange(cost.size).reshape(shape)
+    ends, length = [], []
+    for a, b, step in (
+        (np.s_[:, :-1], np.s_[:, 1:], 1.0), (np.s_[:-1], np.s_[1:], 1.0),
+        (np.s_[:-1, :-1], np.s_[1:, 1:], 2**0.5), (np.s_[:-1, 1:], np.s_[1:, :-1], 2**0.5),
+    ):  # fmt: skip
+        ends.append((number[a].ravel(), number[b].ravel()))
+        length.append(step * 0.5 * (cost[a] + cost[b]).ravel())
+    graph = sparse.coo_array((np.concatenate(length), np.concatenate(ends, axis=1)), shape=(cost.size,) * 2)
+    expected = csgraph.dijkstra(graph, directed=False, indices=number[100, 100])[number[199, 0]]
+    assert steps_cost(cost, cells) == pytest.approx(expected)
 
 
 def test_pulled_tight_the_path_costs_no_more():
@@ -197,6 +221,20 @@ def test_both_ends_come_to_lie_in_one_region() -> None:
     assert all(x < 2.5 for x, _ in found)
     fixed = planner.nearest_room(islands(), places[:1], radius=0.2, allow_unknown=False, fixed=[(4.0, 1.5)])
     assert fixed[0][0] > 3.5
+
+
+@pytest.mark.parametrize(
+    ("fixed", "is_right"),
+    [
+        ((0.01, 0.01), False), ((0.01, 2.99), False), ((3.99, 0.01), True), ((3.99, 2.99), True),
+        ((-0.01, 1.5), False), ((4.01, 1.5), False), ((3.0, -0.01), False), ((3.0, 3.01), False),  # outside: they decide nothing
+    ],
+)  # fmt: skip
+def test_a_fixed_place_decides_up_to_the_grids_edge(fixed, is_right) -> None:
+    state = np.zeros((60, 80), np.int8)
+    state[:, 40] = 1
+    ((x, _),) = planner.nearest_room(grid_of(state), [(0.1, 1.5)], radius=0.1, allow_unknown=True, fixed=[fixed])
+    assert (x > 2.0) == is_right
 
 
 def test_a_robot_too_large_for_every_region() -> None:

@@ -8,11 +8,8 @@ import pytest
 from slamcli.config.options import TrackConfig
 from slamcli.geometry import se3
 from slamcli.slam.key_frames import (
-    CROWD_M,
     FEW_NEAR_LANDMARKS,
     MANY_NEAR_FEATURES,
-    MOVED_M,
-    TURNED_RAD,
     Sighting,
     count_crowd,
     wants_key_frame,
@@ -64,9 +61,11 @@ def test_without_depth_there_is_nothing_to_make_landmarks_of():
 @pytest.mark.parametrize(
     ("twist", "overlap", "expected"),
     [
-        ([0, 0, 0.9 * MOVED_M, 0, 0.9 * TURNED_RAD, 0], 0.8, False),
-        ([0, 0, 1.1 * MOVED_M, 0, 0, 0], 0.8, True),
-        ([0, 0, 0, 0, 1.1 * TURNED_RAD, 0], 0.8, True),
+        ([0, 0, 0.28, 0, np.radians(14.0), 0], 0.8, False),
+        ([0, 0, 0.32, 0, 0, 0], 0.8, True),
+        ([0.2, 0.2, 0.2, 0, 0, 0], 0.8, True),  # 0.35 m
+        ([0, 0, 0, 0, np.radians(16.0), 0], 0.8, True),
+        ([0, 0, 0, 0, 0, 0], 0.75, False),
         ([0, 0, 0, 0, 0, 0], 0.74, True),
     ],
 )
@@ -76,8 +75,8 @@ def test_on_depth_the_way_from_the_reference_and_what_is_left_of_it_decide(twist
 
 def test_a_crowd_stands_near_and_looks_the_same_way():
     T = np.tile(np.eye(4), (5, 1, 1))
-    T[1, :3, 3] = [0.9 * CROWD_M, 0, 0]
-    T[2, :3, 3] = [1.1 * CROWD_M, 0, 0]
+    T[1, :3, 3] = [0.09, 0, 0]
+    T[2, :3, 3] = [0.08, 0, 0.08]  # 0.11 m
     T[3] = se3.exp(np.array([0, 0, 0, 0, np.radians(5.5), 0]))
     T[4] = se3.exp(np.array([0, 0, 0, 0, np.radians(6.5), 0]))
     assert count_crowd(T, np.eye(4)) == 3

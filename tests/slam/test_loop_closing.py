@@ -216,3 +216,37 @@ def test_claims_cover_what_is_near_any_of_them(span):
             kept.append(c)
     assert 10 < len(kept) <= len(pairs)
     assert loop_candidates.first_of_each_revisit(pairs[10:], span=span)[0] is pairs[10]
+
+
+def test_a_closure_needs_as_much_evidence_as_asked_for_and_no_more(turn):
+    scene, _, map_ = turn
+    sparse_map = SparseMap.from_map(scene.features, map_)
+    found = next(c for c in verified(scene, sparse_map) if c.is_accepted)
+    pair = Candidate(found.kf_i, found.kf_j, found.score)
+
+    def again(**least) -> Candidate:
+        rng = np.random.default_rng(1)
+        return loop_verification.verify(sparse_map, scene.words, pair, scene.frames(SENSOR), replace(SETTINGS, **least), rng)
+
+    n_matches, n_inliers = again().n_matches, again().n_inliers
+    assert again(min_matches=n_matches, min_inliers=n_inliers).is_accepted
+    assert again(min_matches=n_matches + 1).reason == f"{n_matches} of {n_matches + 1} matches"
+    short = again(min_inliers=n_inliers + 1)
+    assert not short.is_accepted and short.T_ij is None and "landmarks" in short.reason
+    n_found = again(min_inliers=1000).n_inliers  # in the first, wide windows
+    assert again(min_inliers=n_found + 1).reason == f"{n_found} of {n_found + 1} landmarks found again"
+    assert f"{n_found} of" not in again(min_inliers=n_found).reason, "they are enough to look on"
+
+
+@pytest.mark.parametrize("side", ["kf_i", "kf_j"])
+def test_matches_count_where_both_have_depth(turn, side):
+    scene, _, map_ = turn
+    sparse_map = SparseMap.from_map(scene.features, map_)
+    found = next(c for c in verified(scene, sparse_map) if c.is_accepted)
+    depth = scene.features.depth.copy()
+    rows = sparse_map.rows_of(getattr(found, side))
+    depth[rows][np.arange(rows.stop - rows.start) % 8 > 0] = np.nan
+    frames = replace(scene.frames(SENSOR), features=replace(scene.features, depth=depth))
+    pair = Candidate(found.kf_i, found.kf_j, found.score)
+    fate = loop_verification.verify(sparse_map, scene.words, pair, frames, replace(SETTINGS, min_matches=4), np.random.default_rng(1))
+    assert 4 <= fate.n_matches < 0.25 * found.n_matches

@@ -185,7 +185,34 @@ def test_one_closure_alone_joins_nothing():
     assert map_merging.find_join(sparse_map, [measured(T_gc, 3, 1)], least=1) is not None
 
 
-@pytest.mark.parametrize(("n_inliers", "is_joined"), [(60, False), (30, True)])
+@pytest.mark.parametrize(
+    ("twist", "agree"),
+    [
+        ([0.09, 0, 0, 0, 0, 0], True),
+        ([0, 0.06, 0.06, 0, 0, 0], True),
+        ([0, 0.08, 0.08, 0, 0, 0], False),
+        ([0, 0, 0, 0.03, 0.03, 0], True),
+        ([0, 0, 0, 0, 0, 0.055], False),
+    ],
+)
+def test_closures_agree_within_a_tenth_of_a_metre_and_a_twentieth_of_a_radian(twist, agree):
+    sparse_map, T_gc, _ = two_segments(np.random.default_rng(4))
+    found = map_merging.find_join(sparse_map, [measured(T_gc, 3, 1), measured(T_gc, 3, 1, twist)], least=1)
+    assert (found is not None) == agree, "two that differ contradict each other"
+    assert not agree or (len(found.closures) == 2 and found.support == 180)
+
+
+def test_a_join_moves_the_one_segment_and_no_other():
+    sparse_map, T_gc, _ = two_segments(np.random.default_rng(5))
+    sparse_map.kf.segment[5] = 2
+    alone = sparse_map.kf.T_wk[5].copy()
+    map_merging.join(sparse_map, map_merging.find_join(sparse_map, [measured(T_gc, 3, 1), measured(T_gc, 4, 2)], least=2))
+    assert sparse_map.kf.segment.tolist() == [0, 0, 0, 0, 0, 2]
+    np.testing.assert_allclose(sparse_map.kf.T_wk[:5], T_gc[:5], atol=1e-9)
+    np.testing.assert_array_equal(sparse_map.kf.T_wk[5], alone)
+
+
+@pytest.mark.parametrize(("n_inliers", "is_joined"), [(46, False), (45, True)])  # two of these, against two of 90
 def test_what_looks_alike_in_two_places_joins_nothing(n_inliers, is_joined):
     sparse_map, T_gc, _ = two_segments(np.random.default_rng(3))
     true = [measured(T_gc, 3, 1), measured(T_gc, 4, 1)]
