@@ -34,8 +34,8 @@ TRACKING = ["slam/test_tracker.py", "slam/test_depth_tracking.py", "options/test
 LOOPS = ["slam/test_loop_closing.py", "options/test_loop_options.py"]
 TESTS = {  # that are about a module
     "slam/key_frames": ["slam/test_key_frames.py"],
-    "slam/tracker": [*TRACKING, "slam/test_map_segments.py", "slam/test_rests.py"],
-    "slam/localizer": [*TRACKING, "slam/test_map_segments.py"],
+    "slam/tracker": ["slam/test_tracking_decisions.py", *TRACKING, "slam/test_map_segments.py", "slam/test_rests.py"],
+    "slam/localizer": ["slam/test_tracking_decisions.py", *TRACKING, "slam/test_map_segments.py"],
     "slam/map_growth": ["slam/test_map_growth.py", "slam/test_tracker.py", "options/test_tracking_options.py"],
     "slam/loop_candidates": ["slam/test_loop_candidates.py", *LOOPS],
     "slam/loop_verification": LOOPS,
@@ -75,7 +75,7 @@ def main() -> None:
         shutil.copytree(ROOT, copy, ignore=ignored, dirs_exist_ok=True)
         for module in arguments.modules:
             # A process of its own, as what is imported depends on the module.
-            in_fork(lambda module=module: try_module(copy, module, arguments), log=None)
+            in_fork(functools.partial(try_module, copy, module, arguments), log=None)
 
 
 def try_module(copy: Path, module: str, arguments: argparse.Namespace) -> None:

@@ -1,0 +1,174 @@
+"""What tracking decides from frame to frame: where a map begins, what a key frame is, what a lost frame leads to, what predicts."""
+
+import numpy as np
+import pytest
+from scenes import Scene, observe, orbit, room_points, sweep
+
+from slamcli.config.options import SensorConfig, TrackConfig
+from slamcli.geometry import se3
+from slamcli.schema import KEY_FRAME, LOST, RELOCALIZED, TRACKED, frame_poses, frame_segments
+from slamcli.slam import background_prior
+from slamcli.slam.localizer import nothing_seen
+from slamcli.slam.recording import NOTHING_KNOWN, KnownMotion
+from slamcli.slam.tracker import Tracker
+
+SENSOR = SensorConfig(pixel_noise=0.5)
+NO_CROWD = 10**6
+
+
+def seen(T_gc: np.ndarray, *, seed: int = 0, **settings) -> Scene:
+    rng = np.random.default_rng(seed)
+    return observe(T_gc, room_points(2500, rng), rng, per_frame=200, **settings)
+
+
+def track(scene: Scene, *, motion: KnownMotion = NOTHING_KNOWN, until: int | None = None, **settings) -> Tracker:
+    tracker = Tracker(scene.recording(SENSOR), TrackConfig(**settings), np.random.default_rng(0), motion=motion)
+    for i in range(len(scene.T_gc) if until is None else until):
+        tracker.process(i)
+    return tracker
+
+
+def test_a_map_begins_with_just_as_many_features_with_depth_as_wanted():
+    scene = seen(sweep(2))
+    scene.features.depth[::3] = np.nan
+    n, n_depth = len(scene.frames(SENSOR)[0]), int(np.isfinite(scene.frames(SENSOR)[0].depth).sum())
+    assert track(scene, until=1, start_features=n_depth).tracks().state[0] == KEY_FRAME
+    tracker = track(scene, until=1, start_features=n_depth + 1)
+    assert tracker.tracks().state[0] == LOST
+    assert f"{n} features, {n_depth} with depth, {n_depth + 1} wanted" in tracker.lost_reason[0]
+
+
+@pytest.mark.parametrize("gap", [1, 3, 4])
+def test_where_nothing_else_asks_for_one_a_key_frame_is_made_each_time_the_gap_is_over(gap: int):
+    tracker = track(seen(sweep(13)), key_frame_gap=gap, key_frame_share=0.0, key_frame_crowd=NO_CROWD)
+    assert tracker.map().kf_frame.tolist() == list(range(0, 13, gap))
+    assert (tracker.tracks().state == np.where(np.arange(13) % gap, TRACKED, KEY_FRAME)).all()
+
+
+def test_a_frames_reference_is_the_key_frame_that_shares_the_most_with_it():
+    path = sweep(10)
+    tracker = track(seen(np.concatenate([path, path[::-1]])), key_frame_gap=3, key_frame_share=0.0, key_frame_crowd=2)
+    votes = tracker._sparse_map.votes(tracker._previous.landmark[tracker._previous.landmark >= 0])
+    last = tracker.tracks().ref_kf[-1]
+    assert tracker.tracks().state[-1] == TRACKED and votes[last] == votes.max() > 50 and last != len(votes) - 1
+
+
+def test_the_rule_is_told_what_a_frame_sees_of_what():
+    scene = seen(sweep(8))
+    scene.features.depth[::5] = np.nan
+    tracker = track(scene, key_frame_gap=4, key_frame_share=0.0, key_frame_crowd=NO_CROWD, until=7)
+    frame, landmark = tracker._previous.features, tracker._previous.landmark
+    has_depth = np.isfinite(frame.depth)
+    sighting = tracker._sighting(6, frame, landmark)
+    assert sighting.n_landmarks == (landmark >= 0).sum() > 50
+    assert sighting.frames_since == 6 - tracker.map().kf_frame[-1] > 0
+    assert 0 < sighting.n_near_landmarks < sighting.n_landmarks
+    assert sighting.n_near_landmarks + sighting.n_near_new == has_depth.sum()
+    assert sighting.n_near_new == has_depth[landmark < 0].sum()
+    sparse_map = tracker._sparse_map
+    of_reference = sparse_map.landmarks_of(int(tracker.tracks().ref_kf[6]))
+    assert sighting.n_reference == (sparse_map.lm.n_obs[of_reference] >= 2).sum() < len(of_reference)
+    here = sparse_map.kf.T_wk[:, :3, 3] - frame_poses(tracker.tracks(), tracker.map())[6, :3, 3]
+    assert sighting.n_crowd == (np.linalg.norm(here, axis=1) < 0.1).sum()
+
+
+def test_of_the_only_key_frame_all_landmarks_count_and_another_segments_crowd_does_not():
+    tracker = track(seen(np.repeat(sweep(2)[:1], 3, axis=0)), until=2)
+    frame, landmark = tracker._previous.features, tracker._previous.landmark
+    sighting = tracker._sighting(1, frame, landmark)
+    assert sighting.n_reference == len(tracker._sparse_map.landmarks_of(0)) > 150 and sighting.n_crowd == 1
+    tracker._sparse_map.add_key_frame(0, np.eye(4), segment=1)
+    assert tracker._sighting(1, frame, landmark).n_crowd == 1
+
+
+def lost_and_back(*parts: tuple[str, int], blind: bool = False) -> tuple[Scene, np.ndarray]:
+    """Frames in a known place ("here"), in another ("there") that was never seen, and which are dark, in this order."""
+    here = orbit(60, turns=0.1)
+    poses, dark, k = [], [], 0
+    for where, n in parts:
+        for _ in range(n):
+            poses.append(here[k] if where == "here" else se3.exp(np.array([0, 0, 0, 0, 0, np.pi])) @ here[k])
+            if where == "dark":
+                dark.append(len(poses) - 1)
+            k += 1
+    return seen(np.array(poses), blind=tuple(dark)), np.array([where for where, n in parts for _ in range(n)])
+
+
+def test_lost_frames_count_from_the_last_one_that_was_found():
+    scene, where = lost_and_back(("here", 8), ("there", 4), ("here", 3), ("there", 4))
+    tracker = track(scene, segment_after=5)
+    state = tracker.tracks().state
+    np.testing.assert_array_equal(state == LOST, where == "there")
+    assert state[12] in (RELOCALIZED, KEY_FRAME) and tracker.map().kf_segment.max() == 0
+
+
+def test_a_dark_frame_could_not_be_recognized_and_does_not_count():
+    scene, where = lost_and_back(("here", 8), ("there", 2), ("dark", 5), ("there", 2))
+    assert track(scene, segment_after=5).map().kf_segment.max() == 0
+    tracker = track(scene, segment_after=4)
+    segment = frame_segments(tracker.tracks(), tracker.map())
+    assert segment.tolist() == [0] * 8 + [1] * 2 + [-1] * 5 + [1] * 2, "and the segment begins with the first that was lost"
+    assert set(tracker.lost_reason) == set(np.flatnonzero(where == "dark").tolist())
+    assert all(reason == "0 features: blank or unreadable image" for reason in tracker.lost_reason.values())
+
+
+def test_what_agrees_with_too_little_of_the_map_is_told_so():
+    scene, _ = lost_and_back(("here", 5), ("there", 1))
+    n = len(scene.frames(SENSOR)[5])
+    assert track(scene).lost_reason == {5: f"fewer than 15 of {n} features agree with the map"}
+
+
+def test_after_a_frame_of_which_no_landmark_is_known_those_of_its_reference_are_looked_for():
+    scene = seen(sweep(8, length=0.1))
+    tracker = track(scene, until=6)
+    tracker._previous.remember(tracker._previous.features, nothing_seen(tracker._previous.features))
+    tracker.process(6)
+    tracks = tracker.tracks()
+    assert tracks.state[6] == TRACKED and tracks.n_inliers[6] > 0.7 * tracks.n_inliers[5]
+
+
+def drifting(T_gc: np.ndarray) -> np.ndarray:
+    """Return a background of true motion from frame to frame, but for a drift, in a world of its own."""
+    T = [se3.exp(np.array([1.0, 2.0, 0.5, 0.3, -0.4, 0.2]))]
+    for a, b in zip(T_gc, T_gc[1:], strict=False):
+        T.append(T[-1] @ se3.inverse(a) @ b @ se3.exp(np.array([1e-3, 0, 0, 0, 2e-4, 0])))
+    return np.array(T)
+
+
+def test_the_background_joins_each_key_frame_to_the_one_before():
+    scene = seen(sweep(13))
+    motion = KnownMotion(background=drifting(scene.T_gc))
+    map_ = track(scene, motion=motion, key_frame_gap=4, key_frame_share=0.0, key_frame_crowd=NO_CROWD).map()
+    assert map_.kf_frame.tolist() == [0, 4, 8, 12] and map_.edge_kf.tolist() == [[1, 0], [2, 1], [3, 2]]
+    for (i, j), T_ij, information in zip(map_.edge_kf, map_.edge_T_ij, map_.edge_information, strict=True):
+        T_wi, T_wj = motion.background[map_.kf_frame[[i, j]]]
+        np.testing.assert_allclose(T_ij, se3.inverse(T_wi) @ T_wj, atol=1e-12)
+        np.testing.assert_array_equal(information, background_prior.BETWEEN_KEY_FRAMES)
+
+
+def test_a_key_frame_is_joined_by_the_background_within_its_segment_alone():
+    scene, _ = lost_and_back(("here", 4), ("there", 8))
+    motion = KnownMotion(background=np.tile(np.eye(4), (12, 1, 1)))
+    tracker = track(scene, motion=motion, until=4)
+    frame = scene.frames(SENSOR)[8]
+    tracker._segment = 1
+    for i in (8, 9):
+        tracker._add_key_frame(i, scene.frames(SENSOR)[i], np.eye(4), nothing_seen(frame if i == 8 else scene.frames(SENSOR)[9]))
+    map_ = tracker.map()
+    segment = map_.kf_segment[map_.edge_kf]
+    assert (segment[:, 0] == segment[:, 1]).all() and (segment == 1).all(axis=1).sum() == 1
+
+
+def test_where_no_landmark_holds_a_frame_the_background_carries_it_on():
+    scene = seen(sweep(14), blind=(6, 7, 8))
+    background = drifting(scene.T_gc)
+    tracker = track(scene, motion=KnownMotion(background=background))
+    tracks = tracker.tracks()
+    assert (tracks.state != LOST).all() and (tracks.n_inliers[6:9] == 0).all() and (tracks.n_inliers[9:] > 30).all()
+    T_wc = frame_poses(tracks, tracker.map())
+    for i in (6, 7, 8):
+        assert (
+            np.abs(se3.log(se3.inverse(se3.inverse(T_wc[i - 1]) @ T_wc[i]) @ se3.inverse(background[i - 1]) @ background[i])).max() < 1e-9
+        )
+    assert tracker._poses.anchored >= 9 and track(scene, motion=KnownMotion(background=background), until=9)._poses.anchored == 5
+    assert not tracker.lost_reason
