@@ -107,6 +107,11 @@ def test_where_the_graph_contradicts_all_the_map_stays_and_no_further_round_is_m
     assert rounds.tried == [(30, 5)] and rounds.fused == []
 
 
+def test_after_a_round_that_closed_nothing_no_other_is_made(monkeypatch):
+    rounds = Rounds(monkeypatch, alike=[(50, 2)], refused=((50, 2),), rounds=3)
+    assert [c.reason for c in rounds.closer.close_loops()] == ["refused"] and rounds.tried == [(50, 2)]
+
+
 HALVES = [0] * 30 + [1] * 30
 THIRDS = [0] * 20 + [1] * 20 + [2] * 20
 
