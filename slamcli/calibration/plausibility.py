@@ -10,14 +10,16 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
+from numba import f8
 
 from slamcli.calibration import self_calibration
 from slamcli.calibration.self_calibration import Sensing
 from slamcli.config.options import SensorConfig
 from slamcli.depth import noise_model
 from slamcli.geometry import depth_noise, elementary
-from slamcli.geometry.algebra import nearest_rotation, product
+from slamcli.geometry.algebra import nearest_rotation
 from slamcli.geometry.camera import Camera
+from slamcli.jit.kernel import kernel
 from slamcli.sparse_map.sparse_map import SparseMap
 
 # Standard deviations of what is looked for: wide, as whatever the map says is to be heard. Shares of the focal length and of the picture's
@@ -131,22 +133,63 @@ def _misfit(a: Seen, b: Seen, camera: Camera, sensor: SensorConfig) -> np.ndarra
     x = [camera.backproject(seen.xy[is_near], seen.depth[is_near]) for seen in (a, b)]
     noise = noise_model.depth_noise(sensor)
     sigma = np.linalg.norm([depth_noise.sigmas(p[:, 2], noise) for p in x], axis=0)
-    stretch = np.stack([FACTORS, FACTORS, np.ones_like(FACTORS)], axis=1)[:, None]
     misfit = np.zeros((len(FACTORS), int(is_near.sum())))
     for _ in range(ROUNDS):  # false matches lose their weight
-        misfit = _residuals(x[0] / stretch, x[1] / stretch, 1.0 / (1.0 + misfit**2) / sigma**2) / sigma
+        _strain(*x, sigma, misfit)
     return np.median(misfit, axis=1)
 
 
-def _residuals(a: np.ndarray, b: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Return the distances (S, N) [m] that the rigid motion from points a (S, N, 3) to b leaves, of S sets each, weights (S, N).
+def _strain(a: np.ndarray, b: np.ndarray, sigma: np.ndarray, misfit: np.ndarray) -> None:
+    """Write the distances that the rigid motion from points a (N, 3) to b leaves under each of FACTORS, (S, N) in standard deviations.
 
+    misfit holds those of the round before, which say what weight a point has.
     W. Kabsch, A solution for the best rotation to relate two sets of vectors, Acta Cryst. A32, 1976, doi:10.1107/S0567739476001873
     """
-    share = weight / weight.sum(axis=1, keepdims=True)
-    a, b = (p - np.einsum("sn,sni->si", share, p)[:, None] for p in (a, b))
-    R = nearest_rotation(np.einsum("sn,sni,snj->sij", share, a, b))
-    return np.linalg.norm(b - product(a, R), axis=2)
+    middle, moment = np.empty((len(FACTORS), 2, 3)), np.empty((len(FACTORS), 3, 3))
+    a, b = np.ascontiguousarray(a), np.ascontiguousarray(b)
+    _moments(a, b, sigma, FACTORS, misfit, middle, moment)
+    _distances(a, b, sigma, FACTORS, middle, nearest_rotation(moment), misfit)
+
+
+@kernel(error_model="numpy")
+def _moments(
+    a: f8[:, ::1], b: f8[:, ::1], sigma: f8[::1], factor: f8[::1], misfit: f8[:, ::1], middle: f8[:, :, ::1], moment: f8[:, :, ::1]
+) -> None:
+    """Write the weighted means of a and b (S, 2, 3) and their mixed second moments about them (S, 3, 3), x and y shrunk by each factor."""
+    for s in range(len(factor)):
+        shrink = (1.0 / factor[s], 1.0 / factor[s], 1.0)
+        total = 0.0
+        middle[s], moment[s] = 0.0, 0.0
+        for n in range(len(a)):
+            w = 1.0 / ((1.0 + misfit[s, n] * misfit[s, n]) * sigma[n] * sigma[n])
+            total += w
+            for i in range(3):
+                middle[s, 0, i] += w * a[n, i]
+                middle[s, 1, i] += w * b[n, i]
+                for j in range(3):
+                    moment[s, i, j] += w * a[n, i] * b[n, j]
+        for i in range(3):
+            for j in range(3):
+                mixed = moment[s, i, j] - middle[s, 0, i] * middle[s, 1, j] / total
+                moment[s, i, j] = mixed / total * shrink[i] * shrink[j]
+        for i in range(3):
+            middle[s, 0, i] *= shrink[i] / total
+            middle[s, 1, i] *= shrink[i] / total
+
+
+@kernel(error_model="numpy")
+def _distances(
+    a: f8[:, ::1], b: f8[:, ::1], sigma: f8[::1], factor: f8[::1], middle: f8[:, :, ::1], R: f8[:, :, ::1], misfit: f8[:, ::1]
+) -> None:
+    """Write the lengths of b - a R (S, N) about the means, in sigma."""
+    for s in range(len(factor)):
+        shrink = 1.0 / factor[s]
+        for n in range(len(a)):
+            a0, a1, a2 = shrink * a[n, 0] - middle[s, 0, 0], shrink * a[n, 1] - middle[s, 0, 1], a[n, 2] - middle[s, 0, 2]
+            d0 = shrink * b[n, 0] - middle[s, 1, 0] - (a0 * R[s, 0, 0] + a1 * R[s, 1, 0] + a2 * R[s, 2, 0])
+            d1 = shrink * b[n, 1] - middle[s, 1, 1] - (a0 * R[s, 0, 1] + a1 * R[s, 1, 1] + a2 * R[s, 2, 1])
+            d2 = b[n, 2] - middle[s, 1, 2] - (a0 * R[s, 0, 2] + a1 * R[s, 1, 2] + a2 * R[s, 2, 2])
+            misfit[s, n] = np.sqrt(d0 * d0 + d1 * d1 + d2 * d2) / sigma[n]
 
 
 def _summit(total: np.ndarray, best: int) -> float:

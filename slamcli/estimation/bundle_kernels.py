@@ -260,3 +260,56 @@ def step(
         expected += d2 * (b_l[lm, 2] + damping * V[lm, 2, 2] * d2)
         x_new[lm, 0], x_new[lm, 1], x_new[lm, 2] = x_w[lm, 0] + d0, x_w[lm, 1] + d1, x_w[lm, 2] + d2
     return expected
+
+
+@kernel(error_model="numpy")
+def shared_gradient(
+    T: f8[:, :, ::1],
+    x_w: f8[:, ::1],
+    obs_kf: u8[::1],
+    offset: i8[::1],
+    place: i8[::1],
+    measured: f8[:, ::1],
+    camera: f8[::1],
+    column: f8[:, ::1],
+    W: f8[:, :, ::1],
+    V_inv: f8[:, ::1],
+    reduced: f8[:, ::1],
+    lifted: f8[:, ::1],
+):
+    """Add up J_landmark^T w J in lifted (L, 3) and J_pose^T w J, less what goes with the landmarks, in reduced (n, 6); both hold 0 before.
+
+    column (O, 3) : of J, the growth of u, v [px] and depth [m]. The rows of J_pose and J_landmark are those of `linearize`.
+    """
+    fx, fy = camera[0], camera[1]
+    for lm in range(len(x_w)):
+        px, py, pz = x_w[lm, 0], x_w[lm, 1], x_w[lm, 2]
+        for o in range(offset[lm], offset[lm + 1]):
+            R, f = T[obs_kf[o]], place[obs_kf[o]]
+            inv_px, inv_z = measured[o, 3], measured[o, 4]
+            x = R[0, 0] * px + R[0, 1] * py + R[0, 2] * pz + R[0, 3]
+            y = R[1, 0] * px + R[1, 1] * py + R[1, 2] * pz + R[1, 3]
+            z = R[2, 0] * px + R[2, 1] * py + R[2, 2] * pz + R[2, 3]
+            if not (inv_px > 0.0 and z > Z_MIN):
+                continue
+            u, v = column[o, 0] * inv_px * inv_px, column[o, 1] * inv_px * inv_px
+            q0, q1 = fx / z * u, fy / z * v
+            q2 = column[o, 2] * inv_z * inv_z - (q0 * x + q1 * y) / z
+            for j in range(3):
+                lifted[lm, j] += R[0, j] * q0 + R[1, j] * q1 + R[2, j] * q2
+            if f >= 0:
+                row = reduced[f]
+                row[0] += q0
+                row[1] += q1
+                row[2] += q2
+                row[3] += y * q2 - z * q1
+                row[4] += z * q0 - x * q2
+                row[5] += x * q1 - y * q0
+        l0, l1, l2 = lifted[lm, 0], lifted[lm, 1], lifted[lm, 2]
+        y0 = V_inv[lm, 0] * l0 + V_inv[lm, 1] * l1 + V_inv[lm, 2] * l2
+        y1 = V_inv[lm, 1] * l0 + V_inv[lm, 3] * l1 + V_inv[lm, 4] * l2
+        y2 = V_inv[lm, 2] * l0 + V_inv[lm, 4] * l1 + V_inv[lm, 5] * l2
+        for o in range(offset[lm], offset[lm + 1]):
+            f = place[obs_kf[o]]
+            for i in range(6 if f >= 0 else 0):
+                reduced[f, i] -= W[o, 0, i] * y0 + W[o, 1, i] * y1 + W[o, 2, i] * y2

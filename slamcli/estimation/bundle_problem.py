@@ -174,6 +174,19 @@ class Problem:
         kernels.eliminate(*blocks, damping, hold, self.system.block_of, self.system.blocks, self.rhs, self.V_inv, self._scratch)
         self._edge_terms.add_to(self.system.blocks)
 
+    def shared_gradients(self, used: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Compute J_map^T w J of numbers that all observations share: what eliminating the landmarks leaves of it, and the landmarks' part.
+
+        used (O, 5) : what was measured, as in `measured`; columns : (O, 3, G) of J, the growth of u, v [px], depth [m] per unit of each number
+        Returns (G, 6 n) and (G, L, 3), at the start, where the problem is to be linearized and its landmarks eliminated.
+        """
+        per_number = np.ascontiguousarray(columns.transpose(2, 0, 1))
+        reduced, lifted = np.zeros((len(per_number), *self.rhs.shape)), np.zeros((len(per_number), *self.normal.b_l.shape))
+        seen = (self._obs_kf, self._offset, self.place, used, self._camera)
+        for g, column in enumerate(per_number):
+            kernels.shared_gradient(*self.start, *seen, column, self.normal.W, self.V_inv, reduced[g], lifted[g])
+        return reduced.reshape(len(reduced), -1), lifted
+
     def step(self, at: Variables, damping: float) -> Step:
         """Solve the damped normal equations of a linearized problem, and take the step from where it was linearized."""
         self.eliminate(damping, self.hold)

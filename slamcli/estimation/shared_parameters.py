@@ -40,13 +40,10 @@ def estimate(problem: Problem, columns: np.ndarray, *, prior: np.ndarray, prior_
     used[:, [INV_SIGMA_PX, INV_SIGMA_Z]] *= is_used[:, None]
     sqrt_w = used[:, [INV_SIGMA_PX, INV_SIGMA_PX, INV_SIGMA_Z]]
     r = (problem.predict(problem.start) - used[:, PREDICTED]) * sqrt_w
-    rhs_0, b_0 = _gradient(problem, used)
-    reduced, lifted = np.empty((columns.shape[2], len(rhs_0))), np.empty((columns.shape[2], *b_0.shape))
-    for g in range(columns.shape[2]):
-        shifted = used.copy()
-        shifted[:, PREDICTED] += columns[:, :, g]
-        rhs, b = _gradient(problem, shifted)
-        reduced[g], lifted[g] = rhs - rhs_0, b - b_0
+    problem.linearize(problem.start, measured=used)
+    problem.eliminate(LEAST_DAMPING, problem.hold)
+    reduced, lifted = problem.shared_gradients(used, columns)
+    rhs_0, b_0 = problem.rhs.ravel(), problem.normal.b_l
     factor = problem.system.factorize()
     if factor is None:
         return None
@@ -59,13 +56,6 @@ def estimate(problem: Problem, columns: np.ndarray, *, prior: np.ndarray, prior_
     # b is minus the gradient: J_map^T w r = -b_0
     value = solve(A, product(J.T, r.ravel()) + through_map[:, -1] + prior * weight)
     return Shared(value=value, sigma=np.sqrt(np.diag(inverse(A))))
-
-
-def _gradient(problem: Problem, measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Compute minus the gradient of the map had the observations measured this: of the reduced system, and of the landmarks."""
-    problem.linearize(problem.start, measured=measured)
-    problem.eliminate(LEAST_DAMPING, problem.hold)
-    return problem.rhs.copy().ravel(), problem.normal.b_l.copy()
 
 
 def _landmark_product(a: np.ndarray, V_inv: np.ndarray, b: np.ndarray) -> float:

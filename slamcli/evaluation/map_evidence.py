@@ -7,9 +7,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numba import f4, f8, i4, i8
 
 from slamcli.depth.icp import OrientedPoints
 from slamcli.geometry import se3
+from slamcli.jit.kernel import kernel
 from slamcli.schema import Grid
 
 MOST_VIEWS = 60  # looked at, evenly spread; every pair of them is compared
@@ -148,24 +150,64 @@ def compare(source: View, target: View) -> tuple[int, np.ndarray]:
     Counted are points of a surface of the same direction, at most FARTHEST_TWIN in front of that seen.
     """
     nothing = 0, np.zeros(0)
+    if source.T_lc[:3, 2] @ target.T_lc[:3, 2] < SAME_WAY or not len(source.surface) or not len(target.surface):  # they look apart
+        return nothing
     T_ts = se3.inverse(target.T_lc) @ source.T_lc
-    if T_ts[2, 2] < SAME_WAY or not len(source.surface) or not len(target.surface):  # they look apart
-        return nothing
-    xyz = se3.transform(T_ts, source.surface.xyz[::SAMPLED].astype(np.float64))
-    normal, z = source.surface.normal[::SAMPLED] @ T_ts[:3, :3].T, xyz[:, 2]
-    sigma = np.sqrt(source.surface.variance[::SAMPLED])
-    fx, fy, cx, cy = target.surface.pinhole
-    with np.errstate(divide="ignore", invalid="ignore"):
-        column, row = np.rint(xyz[:, 0] / z * fx + cx), np.rint(xyz[:, 1] / z * fy + cy)
-    height, width = target.surface.row.shape
-    is_in = (z > NEAREST) & (row >= 0) & (column >= 0) & (row < height) & (column < width)
-    if not is_in.any():
-        return nothing
-    met = target.surface.row[row[is_in].astype(np.int64), column[is_in].astype(np.int64)]
-    is_met = met >= 0
-    xyz, normal, sigma, met = xyz[is_in][is_met], normal[is_in][is_met], sigma[is_in][is_met], met[is_met]
-    n = target.surface.normal[met]
-    in_front = ((xyz - target.surface.xyz[met]) * n).sum(axis=1)
-    is_same = (normal * n).sum(axis=1) > SAME_SURFACE
-    limit = THICKNESS + THICKNESS_SIGMAS * (sigma + np.sqrt(target.surface.variance[met]))
-    return int((is_same & (np.abs(in_front) < limit)).sum()), in_front[is_same & (in_front >= limit) & (in_front < FARTHEST_TWIN)]
+    fitted = np.zeros(2, dtype=np.int64)
+    in_front = np.empty(len(source.surface) // SAMPLED + 1)
+    _compare(
+        np.ascontiguousarray(T_ts),
+        *_arrays(source.surface),
+        *_arrays(target.surface),
+        target.surface.row,
+        target.surface.pinhole,
+        in_front,
+        fitted,
+    )
+    return int(fitted[0]), in_front[: fitted[1]]
+
+
+def _arrays(surface: OrientedPoints) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    return surface.xyz, surface.normal, surface.variance
+
+
+@kernel
+def _compare(
+    T_ts: f8[:, ::1],
+    xyz: f4[:, ::1],
+    normal: f4[:, ::1],
+    variance: f4[::1],
+    met_xyz: f4[:, ::1],
+    met_normal: f4[:, ::1],
+    met_variance: f4[::1],
+    row_at: i4[:, ::1],
+    pinhole: f8[::1],
+    in_front: f8[::1],
+    fitted: i8[::1],
+) -> None:
+    """Count in fitted[0] the sampled points that lie on the surface they meet; list how far the others are in front, fitted[1] of them."""
+    height, width = row_at.shape
+    for k in range(0, len(xyz), SAMPLED):
+        p, n = xyz[k], normal[k]
+        z = T_ts[2, 0] * p[0] + T_ts[2, 1] * p[1] + T_ts[2, 2] * p[2] + T_ts[2, 3]
+        if not z > NEAREST:
+            continue
+        x = T_ts[0, 0] * p[0] + T_ts[0, 1] * p[1] + T_ts[0, 2] * p[2] + T_ts[0, 3]
+        y = T_ts[1, 0] * p[0] + T_ts[1, 1] * p[1] + T_ts[1, 2] * p[2] + T_ts[1, 3]
+        column, line = np.rint(x / z * pinhole[0] + pinhole[2]), np.rint(y / z * pinhole[1] + pinhole[3])
+        if not (0 <= line < height and 0 <= column < width):
+            continue
+        met = row_at[int(line), int(column)]
+        if met < 0:
+            continue
+        q, m = met_xyz[met], met_normal[met]
+        cosine = 0.0
+        for i in range(3):
+            cosine += (T_ts[i, 0] * n[0] + T_ts[i, 1] * n[1] + T_ts[i, 2] * n[2]) * m[i]
+        distance = (x - q[0]) * m[0] + (y - q[1]) * m[1] + (z - q[2]) * m[2]
+        limit = THICKNESS + THICKNESS_SIGMAS * (np.sqrt(variance[k]) + np.sqrt(met_variance[met]))
+        if cosine > SAME_SURFACE and abs(distance) < limit:
+            fitted[0] += 1
+        elif cosine > SAME_SURFACE and limit <= distance < FARTHEST_TWIN:
+            in_front[fitted[1]] = distance
+            fitted[1] += 1

@@ -1,5 +1,6 @@
 """What a run's files are checked against, and what those of them that no stage can make again are restored from."""
 
+import functools
 import hashlib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -67,14 +68,18 @@ def read_config(path: Path) -> Config:
 
     A file cut short may still be valid TOML, and would silently fall back to the defaults.
     """
-    data = read_bytes(path, limit=toml.LARGEST_FILE)
+    return _sealed_config(read_bytes(path, limit=toml.LARGEST_FILE), str(path))
+
+
+@functools.lru_cache(maxsize=8)  # every step of a command asks for it
+def _sealed_config(data: bytes, source: str) -> Config:
     text = data[: data.rfind(SEAL.encode())] if SEAL.encode() in data else b""
     if text + _seal(text) != data:
         raise SlamError(
-            f"{path}: not as slamcli wrote it; slamcli run restores it from what the stages recorded, "
+            f"{source}: not as slamcli wrote it; slamcli run restores it from what the stages recorded, "
             "or takes your changes with -s section.key=value or --config FILE"
         )
-    return toml.parse(text, source=str(path))
+    return toml.parse(text, source=source)
 
 
 def _seal(text: bytes) -> bytes:
