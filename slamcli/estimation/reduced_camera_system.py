@@ -9,11 +9,13 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+from numba import f8, i8
 from scipy.sparse import bsr_array, csr_array
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from slamcli.geometry import banded_cholesky
 from slamcli.geometry.algebra import inverse, product
+from slamcli.jit.kernel import kernel
 
 ORDER_FROM = 40  # free key frames from which the search for a narrow band pays
 RELATIVE_RESIDUAL, MOST_ITERATIONS = 1e-9, 2000  # of conjugate gradients
@@ -112,10 +114,7 @@ class ReducedSystem:
     def _upper(self, stride: int) -> np.ndarray:
         """Return the upper triangle, entry (row, column) of the system at row * stride + column."""
         flat = np.zeros(6 * self.n * stride + 6 * self.n)
-        for i in range(6):
-            for j in range(6):
-                first = 0 if j >= i else self.n  # nothing below the diagonal: in a band that place belongs to the row before
-                flat[(6 * self.row[first:] + i) * stride + 6 * self.column[first:] + j] = self.blocks[first:, i, j]
+        _spread(self.blocks, self.row, self.column, self.n, stride, flat)
         return flat
 
     def _iterative(self) -> Factor | None:
@@ -130,6 +129,16 @@ class ReducedSystem:
         order = np.lexsort((column, row))
         start = np.searchsorted(row[order], np.arange(self.n + 1))
         return _ConjugateGradients(bsr_array((blocks[order], column[order], start), shape=(6 * self.n, 6 * self.n)), inverted)
+
+
+@kernel
+def _spread(blocks: f8[:, :, ::1], row: i8[::1], column: i8[::1], n: i8, stride: i8, flat: f8[::1]):
+    """Write entry (row, column) of the system to row * stride + column of `flat`; the first n blocks are the diagonal's."""
+    for b in range(len(blocks)):
+        for i in range(6):
+            start = (6 * row[b] + i) * stride + 6 * column[b]
+            for j in range(i if b < n else 0, 6):  # in a band, the place below the diagonal belongs to the row before
+                flat[start + j] = blocks[b, i, j]
 
 
 def order_and_blocks(
