@@ -135,7 +135,7 @@ def _misfit(a: Seen, b: Seen, camera: Camera, sensor: SensorConfig) -> np.ndarra
     sigma = np.linalg.norm([depth_noise.sigmas(p[:, 2], noise) for p in x], axis=0)
     misfit = np.zeros((len(FACTORS), int(is_near.sum())))
     for _ in range(ROUNDS):  # false matches lose their weight
-        _strain(*x, sigma, misfit)
+        _strain(x[0], x[1], sigma, misfit)
     return np.median(misfit, axis=1)
 
 

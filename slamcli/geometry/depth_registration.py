@@ -8,10 +8,12 @@ import numpy as np
 from numba import f4, f8, i8
 
 from slamcli.geometry import elementary, se3
+from slamcli.geometry.algebra import inverse, product
 from slamcli.geometry.camera import EQUIDISTANT, ON_AXIS, Camera
 from slamcli.jit.kernel import kernel
 
 OVERLAP = 1.1  # by which the footprints of neighbouring readings overlap, so that a slanted surface shows no holes
+PATH_REACH = 0.1  # of a point's depth, by which the offset of the cameras may move it on a path that is a cubic
 SURFACE = 0.03  # relative difference up to which neighbouring readings are of one surface
 
 
@@ -30,6 +32,28 @@ class Registration:
         ray[..., :2] = self.depth_camera.rays
         return np.ascontiguousarray(se3.rotate(self.T_cd[:3, :3], ray).astype(np.float32))
 
+    @cached_property
+    def _near(self) -> float:
+        """Return the least depth [m] for which `_path` holds: there the offset of the cameras moves a point by PATH_REACH of its depth."""
+        return max(float(np.linalg.norm(self.T_cd[:3, 3])) / PATH_REACH, 1e-6)
+
+    @cached_property
+    def _path(self) -> np.ndarray:
+        """Return how the raw pixel of the colour camera moves as what a pixel of the depth camera sees comes nearer, (h, 2, 4, w) float32.
+
+        u, v = sum over n of path[.., n, ..] (near / depth)^n: what a lens does to it is too slow to be computed for each reading. Empty without a lens.
+        """
+        if not self.colour_camera.is_distorted:
+            return np.empty((0, 2, 4, 0), dtype=np.float32)
+        nearness = 0.5 - 0.5 * elementary.cos(np.pi * (np.arange(4) + 0.5) / 4.0)  # where the error of a cubic is least
+        pixel = np.empty((4, *self._ray.shape[:2], 2))
+        for k, share in enumerate(nearness):
+            x = self._ray + share / self._near * self.T_cd[:3, 3]
+            with np.errstate(divide="ignore", invalid="ignore"):
+                pixel[k] = self.colour_camera.distort(self.colour_camera.project(np.where(x[..., 2:] > 0.0, x, np.nan)))
+        powers = inverse(np.stack([nearness**n for n in range(4)], axis=1))
+        return np.ascontiguousarray(product(powers, pixel.reshape(4, -1)).reshape(pixel.shape).transpose(1, 3, 0, 2).astype(np.float32))
+
     def apply(self, depth: np.ndarray) -> np.ndarray:
         """Return depth (h, w) float32 [m] of the depth camera as the colour camera would see it, (H, W) float32, NaN = none.
 
@@ -40,7 +64,8 @@ class Registration:
         magnification = np.array([to.fx / self.depth_camera.fx, to.fy / self.depth_camera.fy]) * (0.5 * OVERLAP)
         lens = 2 if to.lens == EQUIDISTANT else 3 if to.is_rational else 1 if to.is_distorted else 0
         intrinsics = np.array([to.fx, to.fy, to.cx, to.cy])
-        splat(np.ascontiguousarray(depth), self._ray, self.T_cd[:3, 3].copy(), intrinsics, lens, to.coefficients, magnification, out)
+        to_colour = (self._ray, self.T_cd[:3, 3].copy(), intrinsics, lens, to.coefficients, self._near, self._path)
+        splat(np.ascontiguousarray(depth), *to_colour, magnification, out)
         return out
 
 
@@ -79,7 +104,7 @@ def bend(x, y, lens, k):
     return bent_x, bent_y
 
 
-@kernel
+@kernel(error_model="numpy")
 def splat(
     depth: f4[:, ::1],
     ray: f4[:, :, ::1],
@@ -87,39 +112,50 @@ def splat(
     intrinsics: f8[::1],
     lens: i8,
     k: f8[::1],
+    near: f8,
+    path: f4[:, :, :, ::1],
     half: f8[::1],
     out: f4[:, ::1],
 ):
     """Lay each reading of `depth` on `out` (H, W), filled with inf before; the nearest wins, and what is left uncovered becomes NaN.
 
-    ray (h, w, 3), t (3,): x_c = depth * ray + t. half (2,): half a footprint's width and height [px] at equal distances.
+    ray (h, w, 3), t (3,): x_c = depth * ray + t. near, path : of `Registration`, for a lens.
+    half (2,): half a footprint's width and height [px] at equal distances.
     """
     fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
-    rows, columns = out.shape
+    rows, columns, width = out.shape[0], out.shape[1], depth.shape[1]
+    us, vs, zs, sizes = np.empty(width), np.empty(width), np.empty(width), np.empty(width)
     for i in range(depth.shape[0]):
-        for j in range(depth.shape[1]):
+        for j in range(width):  # without a branch: several pixels a step
             d = f8(depth[i, j])
-            if not d > 0.0:
+            zs[j] = d * ray[i, j, 2] + t[2]
+            sizes[j] = d / zs[j]
+        if lens == 0:
+            for j in range(width):
+                d, inverse = f8(depth[i, j]), 1.0 / zs[j]
+                us[j], vs[j] = fx * ((d * ray[i, j, 0] + t[0]) * inverse) + cx, fy * ((d * ray[i, j, 1] + t[1]) * inverse) + cy
+        else:
+            for j in range(width):
+                s = near / f8(depth[i, j])
+                us[j] = path[i, 0, 0, j] + s * (path[i, 0, 1, j] + s * (path[i, 0, 2, j] + s * path[i, 0, 3, j]))
+                vs[j] = path[i, 1, 0, j] + s * (path[i, 1, 1, j] + s * (path[i, 1, 2, j] + s * path[i, 1, 3, j]))
+        for j in range(width):
+            d, z, u, v = f8(depth[i, j]), zs[j], us[j], vs[j]
+            if not (d > 0.0 and z > 0.0):
                 continue
-            z = d * ray[i, j, 2] + t[2]
-            if not z > 0.0:
-                continue
-            inverse = 1.0 / z
-            x, y = (d * ray[i, j, 0] + t[0]) * inverse, (d * ray[i, j, 1] + t[1]) * inverse
-            if lens != 0:
-                x, y = bend(x, y, lens, k)
-            u, v, size = fx * x + cx, fy * y + cy, d * inverse
-            half_u, half_v = half[0] * size, half[1] * size
+            if lens != 0 and not d >= near:
+                x, y = bend((d * ray[i, j, 0] + t[0]) / z, (d * ray[i, j, 1] + t[1]) / z, lens, k)
+                u, v = fx * x + cx, fy * y + cy
             if not (u > -0.5 and v > -0.5 and u < columns - 0.5 and v < rows - 0.5):
                 continue
-            half_u, half_v = min(half_u, u + 1.0), min(half_v, v + 1.0)
+            half_u, half_v = min(half[0] * sizes[j], u + 1.0), min(half[1] * sizes[j], v + 1.0)
             left, right = int(u - half_u + 1.0), min(int(u + half_u), columns - 1)  # u - half_u > -1 here: truncation rounds down
             top, bottom = int(v - half_v + 1.0), min(int(v + half_v), rows - 1)
-            near = f4(z)
+            reading = f4(z)
             for row in range(top, bottom + 1):
                 for column in range(left, right + 1):
-                    if near < out[row, column]:
-                        out[row, column] = near
+                    if reading < out[row, column]:
+                        out[row, column] = reading
     for row in range(rows):
         for column in range(columns):
             if out[row, column] == np.inf:
