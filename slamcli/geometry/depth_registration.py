@@ -35,7 +35,7 @@ class Registration:
     @cached_property
     def _near(self) -> float:
         """Return the least depth [m] for which `_path` holds: there the offset of the cameras moves a point by PATH_REACH of its depth."""
-        return max(float(np.linalg.norm(self.T_cd[:3, 3])) / PATH_REACH, 1e-6)
+        return max(float(np.sqrt(np.square(self.T_cd[:3, 3]).sum())) / PATH_REACH, 1e-6)
 
     @cached_property
     def _path(self) -> np.ndarray:
