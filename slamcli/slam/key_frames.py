@@ -18,7 +18,7 @@ CROWD_M, CROWD_COSINE = 0.1, 0.9945  # key frames nearer than this, and turned b
 
 @dataclass(frozen=True)
 class Sighting:
-    """What a tracked frame sees, as far as the rule asks."""
+    """What a tracked frame sees, as far as the rule asks; `Tracker._sighting` counts it."""
 
     n_landmarks: int  # features that show a landmark
     n_near_landmarks: int  # of these, with depth

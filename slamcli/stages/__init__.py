@@ -1,4 +1,7 @@
-"""The table of stages, from which commands, help, order and staleness follow. Imports nothing heavy: the command line reads it."""
+"""The table of stages, from which commands, help, order and staleness follow. Imports nothing heavy: the command line reads it.
+
+CONTRIBUTING.md lists what else a new stage needs.
+"""
 
 from dataclasses import dataclass
 
