@@ -19,6 +19,10 @@ if TYPE_CHECKING:
     from slamcli.schema import Grid
 
 
+MOUNT_HEIGHT = 0.25  # [m] of a base frame above the floor: wheel hubs are lower
+MOUNT_TILT = 0.15  # [rad], more than a floor's slope or a recording's error
+
+
 @click.command("export-grid")
 @click.argument("out", type=Target())
 @run_option
@@ -106,7 +110,9 @@ def _start(folder: RunDir, mount: tuple[float, ...] | None) -> tuple[float, floa
 
     mount : of the command; else the run's robot.mount
     """
-    from slamcli.navigation.robot_pose import base_in_camera, base_pose
+    import numpy as np
+
+    from slamcli.navigation.robot_pose import base_in_camera, base_off_floor, base_pose
     from slamcli.runs import placement
     from slamcli.schema import Ground
 
@@ -118,7 +124,16 @@ def _start(folder: RunDir, mount: tuple[float, ...] | None) -> tuple[float, floa
             raise SlamError(f"robot.mount = {error.message}") from error
     if mount is None:
         return placement.read(folder).first
-    return base_pose(folder.load(Ground, "densify").T_lw @ placement.camera_poses(folder)[0], base_in_camera(mount))
+    ground = folder.load(Ground, "densify")
+    T_lc, T_cb = ground.T_lw @ placement.camera_poses(folder)[0], base_in_camera(mount)
+    height, tilt = base_off_floor(T_lc, T_cb)
+    if ground.is_found and (abs(height) > MOUNT_HEIGHT or tilt > MOUNT_TILT):
+        click.echo(
+            f"Warning: with this mount the robot's base is {height:.2f} m above the floor and tilted by {np.degrees(tilt):.0f} degrees, as the "
+            f"camera was at {T_lc[2, 3]:.2f} m; check z, roll and pitch [m, rad]",
+            err=True,
+        )
+    return base_pose(T_lc, T_cb)
 
 
 def warn_without_floor(folder: RunDir) -> None:

@@ -67,7 +67,7 @@ def plan(
 ) -> None:  # fmt: skip
     """Plan a path on the navigation grid and draw it, or through the octree; prints it as CSV: x,y,clearance in metres, level frame.
 
-    The level frame's origin is below the first camera, x its heading, z up. Cells that were never seen count as blocked.
+    Clearance is the room beyond the robot's radius. The level frame's origin is below the first camera, x its heading, z up. Cells that were never seen count as blocked.
 
     \b
       slamcli plan --start first --goal last
@@ -102,14 +102,21 @@ def plan(
         grid, title = _read_map(page), page.name
     radius = Config().robot.radius if radius is None else radius
     if reachable:
-        start, _ = _ends(grid, start, start, trajectory, radius=radius, allow_unknown=allow_unknown)
+        start = _ends(grid, {"start": start}, trajectory, radius=radius, allow_unknown=allow_unknown)["start"]
         walls = _walls(folder) if page is None else []
         _tell_reachable(grid, start, radius, allow_unknown, walls, png, as_json)
         return
     if goal is None:
         raise click.UsageError("give --goal, or --reachable")
-    start, goal = _ends(grid, start, goal, trajectory, radius=radius, allow_unknown=allow_unknown)
-    route = planner.plan(grid, start, goal, radius=radius, clearance=clearance, weight=weight, allow_unknown=allow_unknown)
+    ends = _ends(grid, {"start": start, "goal": goal}, trajectory, radius=radius, allow_unknown=allow_unknown)
+    start, goal = ends["start"], ends["goal"]
+    try:
+        route = planner.plan(grid, start, goal, radius=radius, clearance=clearance, weight=weight, allow_unknown=allow_unknown)
+    except planner.NoWay as error:
+        if png is None:
+            raise
+        _draw_reach(png, grid, [start, goal], radius, allow_unknown, trajectory)
+        raise SlamError(f"{error}; {png} shows what can be reached from the start") from error
     texts = {".csv": _csv(route), ".json": _json(route, start, goal, radius)}
     if out is not None:
         _write(out, texts)
@@ -174,17 +181,12 @@ def _tell_reachable(
     grid: Grid, start: tuple[float, float], radius: float, allow_unknown: bool, walls: list[Wall], png: Path | None, as_json: bool
 ) -> None:
     """Print the area that a robot can get to from `start` and the rooms that it cannot, and draw what of the free floor it cannot."""
-    import numpy as np
-
     from slamcli.navigation.reach import reach
-    from slamcli.schema import Grid
     from slamcli.visualization.grid_picture import save_picture
 
     found = reach(grid, start, radius=radius, allow_unknown=allow_unknown, walls=walls)
     if png is not None:
-        state = np.where((grid.state == 0) & ~found.cells, -1, grid.state).astype(np.int8)
-        seen = Grid(grid.p_occupied, grid.n_seen, state, grid.origin, grid.resolution)
-        save_picture(png, seen, title=f"white: within reach of a robot of {radius:g} m radius")
+        save_picture(png, grid, reached=found.cells, ends=[start], title=f"white: within reach of a robot of {radius:g} m radius")
     if as_json:
         click.echo(json.dumps({"start": _rounded(start), "radius": radius, **found.to_dict()}))
         return
@@ -197,25 +199,31 @@ def _tell_reachable(
         click.echo(f"out of reach: {left}")
 
 
+def _draw_reach(
+    png: Path, grid: Grid, ends: list[tuple[float, float]], radius: float, allow_unknown: bool, trajectory: np.ndarray | None
+) -> None:
+    """Draw what a robot can cover from the first of two places between which there is no way."""
+    from slamcli.navigation import cost_layers
+    from slamcli.visualization.grid_picture import save_picture
+
+    centres = cost_layers.reachable(grid, ends[0], radius=radius, allow_unknown=allow_unknown)
+    reached = cost_layers.swept(grid, centres, radius=radius)
+    title = f"no way for a robot of {radius:g} m radius; white: within reach"
+    save_picture(png, grid, trajectory=trajectory, reached=reached, ends=ends, title=title)
+
+
 def _ends(
-    grid: Grid,
-    start: tuple[float, ...] | str,
-    goal: tuple[float, ...] | str,
-    path: np.ndarray | None,
-    *,
-    radius: float,
-    allow_unknown: bool,
-) -> tuple[tuple[float, float], tuple[float, float]]:
+    grid: Grid, given: dict[str, tuple[float, ...] | str], path: np.ndarray | None, *, radius: float, allow_unknown: bool
+) -> dict[str, tuple[float, float]]:
     """Turn `first` and `last` into places where the robot has room, and say how far these are from the camera's."""
     import numpy as np
 
     from slamcli.errors import SlamError
     from slamcli.navigation import planner
 
-    given = {"start": start, "goal": goal}
     places = {name: (end[0], end[1]) for name, end in given.items() if not isinstance(end, str)}
     if len(places) == len(given):
-        return places["start"], places["goal"]
+        return places
     if path is None:
         raise SlamError("--map: a map file does not tell where a camera was; give --start and --goal as x,y")
     known = path[np.isfinite(path).all(axis=1)]
@@ -228,7 +236,7 @@ def _ends(
         if off > float(grid.resolution):
             click.echo(f"{name}: {place[0]:.2f},{place[1]:.2f}, the nearest place with room, {off:.2f} m from below the camera", err=True)
         places[name] = place
-    return places["start"], places["goal"]
+    return places
 
 
 def _csv(route: Route) -> str:

@@ -4,13 +4,12 @@ import numpy as np
 
 from slamcli.errors import SlamError
 from slamcli.geometry import elementary
-from slamcli.navigation.planner import LARGEST, end_cell, obstacle_distance
+from slamcli.navigation.planner import CROSS, LARGEST, end_cell, obstacle_distance, room
 from slamcli.schema import Grid
 
 LETHAL, INSCRIBED, NEAREST = 100, 99, 98  # an obstacle; the robot would touch; the cost just beyond, which falls off from there
 UNKNOWN = -1
 MAX_CORNERS = 100_000
-CROSS = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]])  # a diagonal step needs both cells beside it, as in the planner
 
 
 def inflated(grid: Grid, *, radius: float, reach: float, falloff: float) -> np.ndarray:
@@ -53,7 +52,7 @@ def reachable(grid: Grid, start: tuple[float, float], *, radius: float, allow_un
     """Find the cells (H, W) that a robot's centre can get to from a place [m, level frame]; SlamError where it does not fit there."""
     from scipy import ndimage
 
-    margin = obstacle_distance(grid, allow_unknown=allow_unknown) - radius
+    margin = room(grid, radius=radius, allow_unknown=allow_unknown)
     row, column = end_cell(grid, margin, "start", start, radius)
     labels, _ = ndimage.label(margin >= 0.0, structure=CROSS)
     return labels == labels[row, column]

@@ -18,6 +18,12 @@ from slamcli.schema import Grid
 
 HALF_DIAGONAL = 0.5 * 2.0**0.5
 LARGEST = 100.0  # [m] of a radius or a clearance, and of a weight
+POCKET = 0.1  # of the largest region: a smaller one is a gap between things in which a robot could turn but not drive
+CROSS = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]])  # neighbours: a diagonal step needs both cells beside it, and so joins nothing more
+
+
+class NoWay(SlamError):
+    """Start and goal each have room, but no way leads from one to the other."""
 
 
 @dataclass(frozen=True)
@@ -38,17 +44,17 @@ def plan(
     radius : m, of the robot; no point of the path is nearer to a blocked cell
     clearance : m, beyond the radius, up to which nearness to obstacles costs
     weight : the factor by which a metre along an obstacle costs more than one in the open
-    Raises SlamError for a start or goal outside the grid or not free, and when no way leads from one to the other.
+    Raises SlamError for a start or goal outside the grid or not free, NoWay when no way leads from one to the other.
     """
     for name, value, least in (("radius", radius, 0.0), ("clearance", clearance, 0.0), ("weight", weight, 0.0)):
         if not (np.isfinite(value) and least <= value <= LARGEST):
             raise SlamError(f"{name} = {value:g}: must be from {least:g} to {LARGEST:g}")
-    margin = obstacle_distance(grid, allow_unknown=allow_unknown) - radius
+    margin = room(grid, radius=radius, allow_unknown=allow_unknown)
     ends = [end_cell(grid, margin, name, xy, radius) for name, xy in (("start", start), ("goal", goal))]
     cost = _cell_cost(margin, clearance, weight)
     cells = _cheapest(cost, ends[0], ends[1])
     if cells is None:
-        raise SlamError(_unreachable(grid, cost, ends, allow_unknown))
+        raise NoWay(_unreachable(grid, cost, ends, allow_unknown))
     corners = pull_tight(cost, cells)
     xy = (corners[:, ::-1] + 0.5) * float(grid.resolution) + grid.origin
     xy = dense(np.concatenate([[start], xy[1:-1], [goal]]) if len(xy) > 1 else np.array([start, goal]), float(grid.resolution))
@@ -61,19 +67,20 @@ def nearest_room(
 ) -> list[tuple[float, float]]:
     """Find, near each of `places` [m, level frame], one where a robot has room, all within one region that it can drive through.
 
-    The region is the one that moves them least; `fixed` places that are in one decide it. A camera does not see the floor below itself,
-    so where it stood is often unknown. Raises SlamError where the robot fits nowhere.
+    The region is the one that moves them least, pockets left out; `fixed` places that are in one decide it. A camera does not see the
+    floor below itself, so where it stood is often unknown. Raises SlamError where the robot fits nowhere.
     """
     from scipy import ndimage
 
-    margin = obstacle_distance(grid, allow_unknown=allow_unknown) - radius
-    labels, n_regions = ndimage.label(margin >= 0.0, structure=np.ones((3, 3), dtype=int))
+    margin = room(grid, radius=radius, allow_unknown=allow_unknown)
+    labels, n_regions = ndimage.label(margin >= 0.0, structure=CROSS)
     if n_regions == 0:
         raise SlamError(f"a robot of {radius:g} m radius fits nowhere in this grid: try a smaller radius, or allow unknown cells")
     rows, columns = np.nonzero(labels)
     xy, region = (np.stack([columns, rows], axis=1) + 0.5) * float(grid.resolution) + grid.origin, labels[rows, columns]
     distance = [np.linalg.norm(xy - place, axis=1) for place in places]
-    index = np.arange(1, n_regions + 1)
+    cells = np.bincount(labels.ravel(), minlength=n_regions + 1)[1:]
+    index = 1 + np.flatnonzero(cells >= POCKET * cells.max())
     best = index[np.argmin(np.sum([ndimage.minimum(d, region, index) for d in distance], axis=0))]
     for place in fixed:
         row, column = (int(i) for i in _cells_of(grid, np.array(place)))
@@ -83,6 +90,12 @@ def nearest_room(
     return [(float(xy[i, 0]), float(xy[i, 1])) for i in found]
 
 
+def room(grid: Grid, *, radius: float, allow_unknown: bool) -> np.ndarray:
+    """Return per cell (H, W) [m] the room beyond a robot's radius, negative where the robot would touch, -inf where a cell is blocked."""
+    distance = obstacle_distance(grid, allow_unknown=allow_unknown)
+    return np.where(_blocked(grid, allow_unknown), -np.inf, distance - radius)
+
+
 def obstacle_distance(grid: Grid, *, allow_unknown: bool) -> np.ndarray:
     """Return per cell (H, W) [m] the distance from its centre to the edge of the nearest blocked cell, 0 inside one.
 
@@ -90,7 +103,7 @@ def obstacle_distance(grid: Grid, *, allow_unknown: bool) -> np.ndarray:
     """
     import cv2
 
-    is_blocked = (grid.state == 1) if allow_unknown else (grid.state != 0)
+    is_blocked = _blocked(grid, allow_unknown)
     pad = 0 if allow_unknown else 1
     free = np.pad((~is_blocked).astype(np.uint8), pad)
     if free.all():
@@ -98,6 +111,10 @@ def obstacle_distance(grid: Grid, *, allow_unknown: bool) -> np.ndarray:
     distance = cv2.distanceTransform(free, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     distance = distance[pad : distance.shape[0] - pad, pad : distance.shape[1] - pad]
     return np.maximum(distance.astype(np.float64) - HALF_DIAGONAL, 0.0) * float(grid.resolution)
+
+
+def _blocked(grid: Grid, allow_unknown: bool) -> np.ndarray:
+    return grid.state == 1 if allow_unknown else grid.state != 0
 
 
 def _cell_cost(margin: np.ndarray, clearance: float, weight: float) -> np.ndarray:
@@ -141,10 +158,11 @@ def _nearest(grid: Grid, margin: np.ndarray, row: int, column: int) -> str:
 def _unreachable(grid: Grid, cost: np.ndarray, ends: list[tuple[int, int]], allow_unknown: bool) -> str:
     from scipy import ndimage
 
-    labels, _ = ndimage.label(np.isfinite(cost), structure=np.ones((3, 3), dtype=int))
+    labels, _ = ndimage.label(np.isfinite(cost), structure=CROSS)
     area = [float((labels == labels[end]).sum()) * float(grid.resolution) ** 2 for end in ends]
     hint = "a smaller radius" if allow_unknown else "a smaller radius, or allow unknown cells"
-    return f"no way leads from start to goal: {area[0]:.1f} m2 can be reached from the start, {area[1]:.1f} m2 from the goal; try {hint}"
+    got = f"the robot's middle gets to {area[0]:.1f} m2 from the start, {area[1]:.1f} m2 from the goal"
+    return f"no way leads from start to goal: {got}; try {hint}"
 
 
 @kernel

@@ -40,3 +40,10 @@ def base_pose(T_lc: np.ndarray, T_cb: np.ndarray) -> tuple[float, float, float]:
     """Return x [m], y [m] and heading [rad] on the floor of a robot's base, T_cb (4, 4) base to camera."""
     T_lb = product(T_lc, T_cb)
     return float(T_lb[0, 3]), float(T_lb[1, 3]), float(elementary.arctan2(T_lb[1, 0], T_lb[0, 0]))
+
+
+def base_off_floor(T_lc: np.ndarray, T_cb: np.ndarray) -> tuple[float, float]:
+    """Return height above the floor [m] and tilt [rad] of a robot's base, T_cb (4, 4) base to camera: both small where the mount is right."""
+    T_lb = product(T_lc, T_cb)
+    lean = np.linalg.norm(T_lb[:2, 2])
+    return float(T_lb[2, 3]), float(elementary.arctan2(lean, T_lb[2, 2]))

@@ -11,17 +11,20 @@ from slamcli.errors import SlamError
 from slamcli.schema import Grid
 
 COLOURS = {"occupied": "#1a1a1a", "free": "#ffffff", "unknown": "#c8c8c8"}
+OUT_OF_REACH = "#f5c77e"  # of free floor
 TRAJECTORY, ROUTE, START, GOAL, BEGAN = "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#c23b22"
 LONGEST_SIDE = 11.0  # inches
 BAR_LENGTHS = np.array([0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0])  # [m]
 
 
 def save_picture(path: Path, grid: Grid, *, trajectory: np.ndarray | None = None, route: np.ndarray | None = None, radius: float = 0.0,
-                 title: str = "") -> None:  # fmt: skip
+                 title: str = "", reached: np.ndarray | None = None, ends: Sequence[Sequence[float]] = ()) -> None:  # fmt: skip
     """Draw a grid.
 
     trajectory : (N, 2 or more) [m, level frame] camera centres; a row of NaN interrupts the line
     route : (M, 2) [m] planned path, drawn as wide as a robot of `radius` [m]
+    reached : (H, W) bool, cells that a robot can cover; free floor beyond them gets a colour of its own
+    ends : x, y [m] of the start, and of a goal, where no route joins them
     """
     path = Path(path)
     if path.suffix.lower() not in (".png", ".pdf", ".svg"):
@@ -34,14 +37,16 @@ def save_picture(path: Path, grid: Grid, *, trajectory: np.ndarray | None = None
     inches = np.maximum(LONGEST_SIDE * size / size.max(), 4.0) + [0.8, 1.4]
     figure = Figure(figsize=tuple(inches))
     FigureCanvasAgg(figure)
-    draw(figure.add_subplot(), grid, trajectory=trajectory, route=route, radius=radius, title=title)
+    axis = figure.add_subplot()
+    draw(axis, grid, trajectory=trajectory, route=route, radius=radius, title=title, reached=reached, ends=ends)
     with files.whole(path) as file:
         figure.savefig(file, format=path.suffix[1:].lower(), dpi=130, bbox_inches="tight")
 
 
 def draw(axis: Any, grid: Grid, *, trajectory: np.ndarray | None = None, route: np.ndarray | None = None, radius: float = 0.0,
-         title: str = "", start: tuple[float, float, float] | None = None, font: float = 8.0) -> None:  # fmt: skip
-    """Draw a grid into matplotlib axes, x to the right, y up.
+         title: str = "", start: tuple[float, float, float] | None = None, font: float = 8.0, reached: np.ndarray | None = None,
+         ends: Sequence[Sequence[float]] = ()) -> None:  # fmt: skip
+    """Draw a grid into matplotlib axes, x to the right, y up; other arguments as of `save_picture`.
 
     start : x [m], y [m], yaw [rad] where the recording began, drawn as an arrow
     font : [pt] of the numbers and the legend
@@ -49,15 +54,20 @@ def draw(axis: Any, grid: Grid, *, trajectory: np.ndarray | None = None, route: 
     from matplotlib.colors import ListedColormap
     from matplotlib.patches import Patch
 
-    names = ("unknown", "free", "occupied")
     extent = _extent(grid)
-    colours = ListedColormap([COLOURS[name] for name in names])
-    axis.imshow(grid.state, origin="lower", extent=extent, cmap=colours, vmin=-1, vmax=1, interpolation="nearest")
-    handles: list[Any] = [Patch(facecolor=COLOURS[name], edgecolor="#888888", label=name) for name in reversed(names)]
+    colours = {"unknown": COLOURS["unknown"], "free": COLOURS["free"], "occupied": COLOURS["occupied"]}
+    shade = grid.state + 1
+    if reached is not None:
+        colours = {"unknown": COLOURS["unknown"], "out of reach": OUT_OF_REACH, "free": COLOURS["free"], "occupied": COLOURS["occupied"]}
+        shade = np.where(shade == 0, 0, np.where((shade == 1) & ~reached, 1, shade + 1))
+    shades = ListedColormap(list(colours.values()))
+    axis.imshow(shade, origin="lower", extent=extent, cmap=shades, vmin=0, vmax=len(colours) - 1, interpolation="nearest")
+    handles: list[Any] = [Patch(facecolor=colour, edgecolor="#888888", label=name) for name, colour in colours.items()][::-1]
     if trajectory is not None and len(trajectory):
         handles += axis.plot(trajectory[:, 0], trajectory[:, 1], color=TRAJECTORY, lw=1.0, label="camera")
     if route is not None and len(route):
         handles += _draw_route(axis, route, radius)
+    handles += _draw_ends(axis, ends)
     if start is not None:
         handles += _draw_start(axis, start, extent)
     axis.set_xlim(extent[:2])
@@ -66,7 +76,7 @@ def draw(axis: Any, grid: Grid, *, trajectory: np.ndarray | None = None, route: 
     axis.set_xlabel("x [m]", fontsize=font)
     axis.set_ylabel("y [m]", fontsize=font)
     axis.tick_params(labelsize=font)
-    axis.set_title(title, fontsize=10)
+    axis.set_title(title, fontsize=10, loc="right")  # the scale bar is at the left
     _scale_bar(axis, extent, font)
     columns = len(handles) if font <= 8.0 else 4
     axis.legend(handles=handles, loc="upper center", bbox_to_anchor=(0.5, -0.015 * font), ncols=columns, fontsize=font, frameon=False)
@@ -85,11 +95,12 @@ def _draw_route(axis: Any, route: np.ndarray, radius: float) -> Sequence[Any]:
         for xy in route[:: max(1, len(route) // 400)]:
             axis.add_patch(Circle(xy, radius, facecolor=ROUTE, edgecolor="none", alpha=0.04))
     line = axis.plot(route[:, 0], route[:, 1], color=ROUTE, lw=1.6, label="path")
-    ends = [
-        *axis.plot(*route[0], marker="o", ms=7, color=START, ls="none", label="start"),
-        *axis.plot(*route[-1], marker="X", ms=8, color=GOAL, ls="none", label="goal"),
-    ]
-    return [*line, *ends]
+    return [*line, *_draw_ends(axis, [route[0], route[-1]])]
+
+
+def _draw_ends(axis: Any, ends: Sequence[Sequence[float]]) -> Sequence[Any]:
+    looks = [{"marker": "o", "ms": 7, "color": START, "label": "start"}, {"marker": "X", "ms": 8, "color": GOAL, "label": "goal"}]
+    return [line for end, look in zip(ends, looks, strict=False) for line in axis.plot(end[0], end[1], ls="none", **look)]
 
 
 def _draw_start(axis: Any, start: tuple[float, float, float], extent: tuple[float, float, float, float]) -> Sequence[Any]:

@@ -15,6 +15,7 @@ from slamcli.depth.coarse_images import encode
 from slamcli.errors import BadFrame
 from slamcli.formats import grid_map, octomap
 from slamcli.geometry import se3
+from slamcli.navigation.robot_pose import OPTICAL_IN_BODY
 from slamcli.runs import pipeline, placement
 from slamcli.runs.run_directory import RunDir
 from slamcli.schema import CoarseDepth, Features, Grid, Ground, Map, Moving, Timing, Tracks
@@ -65,6 +66,24 @@ def test_the_page_tells_where_the_recording_began_and_with_a_mount_where_the_bas
     moved = json.loads(slamcli("export-grid", "map.pgm", "-r", run, "--json", "--mount", "0,0,0.2,0,0,0").stdout)["start"]
     assert moved != about["start"]
     assert slamcli("export-grid", "map.pgm", "-r", run, "--mount", "1,2,3").exit_code == 2
+
+
+def test_a_mount_that_does_not_stand_on_the_floor_is_told(run, here, slamcli):
+    """The recording shows how high its camera was, and how it was tilted."""
+    folder = RunDir(run)
+    T_lc = folder.load(Ground, "densify").T_lw @ placement.camera_poses(folder)[0]
+    R = T_lc[:3, :3] @ OPTICAL_IN_BODY[:3, :3].T  # of the camera's body on a base that stands upright
+    z, roll, pitch = T_lc[2, 3], np.arctan2(R[2, 1], R[2, 2]), -np.arcsin(R[2, 0])
+    for mount, is_right in (
+        ((0.1, 0.0, z, roll, pitch, 0.0), True),
+        ((0.1, 0.0, z - 0.1, roll, pitch + 0.05, 0.5), True),
+        ((0.1, 0.0, z - 0.5, roll, pitch, 0.0), False),
+        ((100.0, 0.0, 1000.0 * z, roll, pitch, 0.0), False),
+        ((0.0, 0.0, z, roll, pitch + 0.5, 0.0), False),
+        ((0.0, 0.0, z, roll + 0.3, pitch, 0.0), False),
+    ):
+        said = slamcli("export-grid", "map.pgm", "-r", run, "--mount", ",".join(f"{value:.6f}" for value in mount)).stderr
+        assert ("check z, roll and pitch" not in said) == is_right, (mount, said)
 
 
 @pytest.mark.parametrize("name", ["map.tif", "map", "map.PGM.txt"])
@@ -313,6 +332,26 @@ def test_plan_tells_what_a_robot_can_reach(slamcli, run, tmp_path):
         < 0.7 * wide["free_m2"]
     )
     assert slamcli("plan", "--start", "0,0", "-r", run).exit_code == 2
+
+
+def test_where_no_way_leads_the_picture_shows_what_is_within_reach(slamcli, run, tmp_path):
+    folder = RunDir(run)
+    grid = folder.load(Grid, "grid2d")
+    state = np.array(grid.state)
+    state[:, state.shape[1] // 2] = 1
+    halves = Grid(grid.p_occupied, grid.n_seen, state, grid.origin, grid.resolution)
+    page = tmp_path / "halves.yaml"
+    grid_map.write(page.with_suffix(".pgm"), grid_map.GridMap.of(halves))
+    middle = float(grid.origin[0]) + state.shape[1] // 2 * float(grid.resolution)
+    ends = [f"{middle - 1.0},0", f"{middle + 1.0},0"]
+    result = slamcli("plan", "--map", page, "--start", ends[0], "--goal", ends[1], "--png", tmp_path / "no.png")
+    assert result.exit_code == 1 and "no way leads" in result.stderr and "no.png" in result.stderr
+    colours = cv2.imread(str(tmp_path / "no.png")).reshape(-1, 3)[:, ::-1]
+    shown = {
+        name: float((colours == np.array(rgb)).all(axis=1).mean()) for name, rgb in (("white", (255, 255, 255)), ("out", (245, 199, 126)))
+    }
+    assert shown["out"] > 0.1 and shown["white"] > 0.1
+    assert "goal" not in slamcli("plan", "--reachable", "--start", "first", "-r", run).stderr
 
 
 @pytest.mark.shows("robot.radius", "robot.mount")

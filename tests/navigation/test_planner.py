@@ -170,8 +170,48 @@ def test_the_place_that_is_proposed_works():
 
 
 def test_unreachable_says_how_much_is_reachable():
-    with pytest.raises(SlamError, match=r"7\.\d m2 can be reached from the start, 7\.\d m2 from the goal; try a smaller radius"):
+    with pytest.raises(SlamError, match=r"gets to 7\.\d m2 from the start, 7\.\d m2 from the goal; try a smaller radius"):
         planner.plan(room_with_wall(gap=(80, 80)), (1.0, 1.0), (1.0, 4.0))
+
+
+def pockets() -> Grid:
+    """A room of 60 x 100 cells, a nook of 7 x 7 that nothing leads to, and one of 31 x 31 that touches the room's corner."""
+    state = np.ones((110, 110), dtype=np.int8)
+    state[45:105, 5:105] = 0
+    state[5:12, 5:12] = 0
+    state[14:45, 74:105] = 0
+    state[44, 74:105] = 1
+    state[44, 73] = 0
+    return grid_of(state)
+
+
+def test_the_nearest_room_is_no_pocket():
+    grid = pockets()
+    camera = (0.3, 0.3)  # above the nook
+    (place,) = planner.nearest_room(grid, [camera], radius=0.1, allow_unknown=False)
+    assert place[1] > 2.25
+    near = [(x, y) for x in np.arange(0.3, 5.2, 0.05) for y in np.arange(2.4, 5.0, 0.05)]
+    assert np.hypot(*np.subtract(place, camera)) <= min(np.hypot(*np.subtract(xy, camera)) for xy in near) + 0.05
+    (large,) = planner.nearest_room(grid, [(4.0, 1.0)], radius=0.1, allow_unknown=False)
+    assert large[1] < 2.2  # a sixth of the floor is no pocket
+
+
+def test_places_of_one_region_have_a_way_between_them():
+    """A corner at which free cells only touch joins nothing: A* needs both cells beside a diagonal step."""
+    state = np.zeros((60, 60), dtype=np.int8)
+    state[:30, 30:] = state[30:, :30] = 1
+    grid = grid_of(state)
+    start, goal = planner.nearest_room(grid, [(0.5, 0.5), (2.5, 2.5)], radius=0.0, allow_unknown=False)
+    assert planner.plan(grid, start, goal, radius=0.0).length > 0.0
+    with pytest.raises(planner.NoWay):
+        planner.plan(grid, (0.5, 0.5), (2.5, 2.5), radius=0.0)
+
+
+def test_a_point_does_not_pass_through_walls():
+    with pytest.raises(planner.NoWay):
+        planner.plan(room_with_wall(gap=(80, 80)), (1.0, 1.0), (1.0, 4.0), radius=0.0)
+    with pytest.raises(SlamError, match="inside an obstacle"):
+        planner.plan(room_with_wall(), (1.0, 2.52), (1.0, 1.0), radius=0.0)
 
 
 def test_a_robot_too_large_for_the_grid():
