@@ -11,6 +11,7 @@ from slamcli.evaluation import map_verdict, of_several, trajectory_error
 from slamcli.evaluation.map_verdict import Verdict
 from slamcli.evaluation.trajectory_error import Ape
 from slamcli.geometry import se3
+from slamcli.runs import placement
 from slamcli.runs.run_directory import RunDir
 from slamcli.runs.staleness import State
 from slamcli.schema import LOST, Closures, Doubt, Features, Ground, Map, Tracks, Trajectory
@@ -18,6 +19,10 @@ from slamcli.schema import LOST, Closures, Doubt, Features, Ground, Map, Tracks,
 UPRIGHT = np.array(
     [[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
 )  # world to level, no floor known
+
+
+MOST_TRUTH_POINTS = 6000
+TRUTH_GAP = 1.0  # [s] without truth, over which its path is not drawn on
 
 
 @dataclass(frozen=True)
@@ -38,16 +43,30 @@ class Content:
     ape: dict[str, Ape]  # by stage; empty without ground truth
     ape_of: list[Ape]  # of each of several recordings, after the last stage; empty where there is one
     no_truth: str  # why there is none, or ""
-    x_truth: np.ndarray  # (N, 3) level frame
+    x_truth: np.ndarray  # (N, 3) level frame; a row of NaN interrupts it
     states: dict[str, State]
     recording: dict[str, Any]
     doubts: list[str] = field(default_factory=list)  # of the recording's reader
     verdict: Verdict | None = None  # on the map, where there is one
+    starts: np.ndarray = field(default_factory=lambda: np.zeros(1, dtype=np.int64))  # (R,) first frame of each recording
+    names: list[str] = field(default_factory=list)  # of several recordings
 
     @property
     def has_pose(self) -> np.ndarray:
         """Say which frames have a pose."""
         return np.isfinite(self.T_lc[:, 0, 0])
+
+    @property
+    def path(self) -> np.ndarray:
+        """Return the camera centres (N, 3) of the frames that have a pose, with a row of NaN between recordings."""
+        parts = [part[np.isfinite(part[:, 0])] for part in np.split(self.T_lc[:, :3, 3], self.starts[1:])]
+        rows = [row for part in parts if len(part) for row in (np.full((1, 3), np.nan), part)]
+        return np.concatenate(rows[1:]) if rows else np.empty((0, 3))
+
+    @property
+    def seconds(self) -> float:
+        """Return how long was recorded [s], what lies between recordings left out."""
+        return float(sum(part[-1] - part[0] for part in np.split(self.stamp, self.starts[1:])))
 
     @property
     def n_lost(self) -> int:
@@ -94,6 +113,8 @@ def collect(run: RunDir) -> Content:
         recording=recording,
         doubts=doubts,
         verdict=map_verdict.of_run(run),
+        starts=placement.beginnings(run),
+        names=[str(entry["name"]) for entry in run.recordings],
     )
 
 
@@ -124,8 +145,10 @@ def _truth_in_level(truth: Trajectory | None, ape: Ape | None, T_lw: np.ndarray)
     """Move the true path to where the estimate lies, for the time that the estimate covers."""
     if truth is None or ape is None:
         return np.empty((0, 3))
-    during = (truth.stamp >= ape.stamp[0]) & (truth.stamp <= ape.stamp[-1])
-    return se3.transform(T_lw @ se3.inverse(ape.T_gw), truth.T_wc[during, :3, 3])
+    during = np.flatnonzero((truth.stamp >= ape.stamp[0]) & (truth.stamp <= ape.stamp[-1]))
+    during = during[:: -(-len(during) // MOST_TRUTH_POINTS) or 1]
+    x_l = se3.transform(T_lw @ se3.inverse(ape.T_gw), truth.T_wc[during, :3, 3])
+    return np.insert(x_l, 1 + np.flatnonzero(np.diff(truth.stamp[during]) > TRUTH_GAP), np.nan, axis=0)
 
 
 def _loops(run: RunDir, stage: str, map_: Map) -> np.ndarray:

@@ -49,7 +49,7 @@ def remarks(content: Content, inspected: Sequence[tuple[str, str]] = ()) -> list
 
 
 def _findings(content: Content) -> list[Remark]:
-    texts = [(one.is_grave, one.text.replace("; slamcli report shows which", ", amber in the charts below")) for one in _doubts(content)]
+    texts = [(one.is_grave, one.text.replace(doubt.SEE_REPORT, ", amber in the charts below")) for one in _doubts(content)]
     return [Remark(BAD if is_grave else NOTE, f"{text[:1].upper()}{text[1:]}.") for is_grave, text in texts]
 
 
@@ -163,8 +163,7 @@ def headline(content: Content) -> str:
 
 def _located(content: Content) -> str:
     n, n_poses = len(content.stamp), int(content.has_pose.sum())
-    path = content.T_lc[content.has_pose, :3, 3]
-    length = float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
-    text = f"{n_poses} of {n} frames located along {length:.1f} m in {content.stamp[-1] - content.stamp[0]:.1f} s"
+    length = float(np.nansum(np.linalg.norm(np.diff(content.path, axis=0), axis=1)))
+    text = f"{n_poses} of {n} frames located along {length:.1f} m in {content.seconds:.1f} s"
     ape = content.ape.get(content.stage)
     return f"{text}; {1000 * float(np.sqrt(np.mean(ape.error**2))):.1f} mm from the truth (RMS)" if ape else text

@@ -4,7 +4,7 @@
   const n = data.time.length;
   const RAMP = [[59, 76, 192], [98, 160, 220], [120, 198, 121], [253, 191, 80], [200, 40, 40]];
   const INK = "#1d2329", SOFT = "#5d6873", LINE = "#e3e7eb", BLUE = "#0072b2", LOST = "rgba(194,59,34,0.14)", DOUBT = "rgba(230,159,0,0.3)", LOOP = "#d55e00", KEY = "#17212b", START = "#00805e";
-  const doubtful = new Set(data.doubtful);
+  const doubtful = new Set(data.doubtful), begins = new Set(data.starts);
   const hasPose = i => data.position[0][i] !== null;
   let cursor = -1;
   const listeners = [];
@@ -59,7 +59,7 @@
     const line = (points, colour, lineWidth, dash) => {
       context.strokeStyle = colour; context.lineWidth = lineWidth; context.setLineDash(dash || []);
       context.beginPath();
-      points.forEach((p, i) => i ? context.lineTo(p[0], p[1]) : context.moveTo(p[0], p[1]));
+      points.forEach((p, i) => p && (points[i - 1] ? context.lineTo(p[0], p[1]) : context.moveTo(p[0], p[1])));
       context.stroke();
     };
     const step = niceStep(size * 1.4, 6), isOnFloor = data.hasFloor && bounds[2][0] < 1.2 * size, floor = isOnFloor ? 0 : Math.floor(bounds[2][0] / step) * step;
@@ -68,12 +68,12 @@
     for (let y = low[1]; y <= high[1] + 1e-9; y += step) line([at(low[0], y, floor), at(high[0], y, floor)], LINE, 1);
     context.fillStyle = SOFT; context.font = "11px sans-serif";
     context.fillText("squares of " + step + " m" + (isOnFloor ? " on the floor" : ", " + floor.toFixed(2) + " m " + (data.hasFloor ? "above the floor" : "high")), 10, height - (width < 420 ? 52 : 9));
-    const truth = data.truth[0].map((x, i) => at(x, data.truth[1][i], data.truth[2][i]));
+    const truth = data.truth[0].map((x, i) => x === null ? null : at(x, data.truth[1][i], data.truth[2][i]));
     if (truth.length) line(truth, "#8a949e", 1.6, [5, 4]);
     context.setLineDash([]);
     data.loops.forEach(([i, k]) => { if (hasPose(i) && hasPose(k)) line([point(i), point(k)], LOOP, 1); });
     for (let i = 1; i < n; i++) {
-      if (!hasPose(i) || !hasPose(i - 1)) continue;
+      if (begins.has(i) || !hasPose(i) || !hasPose(i - 1)) continue;
       const error = data.error.length ? data.error[i] : null;
       line([point(i - 1), point(i)], error === null ? BLUE : rampAt(error / errorTop), 2.2);
     }
@@ -219,6 +219,10 @@
   if (doubtful.size) constant.push("amber in the charts: doubtful");
   document.getElementById("constant").textContent = constant.join("; ");
 
+  const moment = i => {
+    const k = Math.max(data.starts.filter(first => first <= i).length - 1, 0);
+    return (data.names.length ? data.names[k] + " at " : "") + (data.time[i] - data.time[data.starts[k]]).toFixed(2) + " s";
+  };
   const drawChart = chart => {
     const [context, width, height] = fit(chart.canvas);
     const w = width - LEFT - RIGHT, h = height - TOP - BOTTOM;
@@ -241,6 +245,13 @@
       context.beginPath(); context.moveTo(LEFT, y(v)); context.lineTo(width - RIGHT, y(v)); context.stroke();
       context.fillText(Number(v.toPrecision(4)), LEFT - 5, y(v));
     }
+    context.textAlign = "left"; context.textBaseline = "top";
+    data.names.forEach((name, k) => {  // where each of several recordings begins
+      const a = x(data.time[data.starts[k]]);
+      if (a < LEFT - 1 || a > width - RIGHT) return;
+      context.beginPath(); context.moveTo(a, TOP); context.lineTo(a, TOP + h); context.stroke();
+      context.fillText(name, a + 3, TOP + 1);
+    });
     context.textAlign = "center"; context.textBaseline = "top";
     for (let t = Math.ceil(range[0] / stepX) * stepX; t <= range[1]; t += stepX) context.fillText(Number(t.toPrecision(5)) + " s", Math.min(Math.max(x(t), LEFT + 8), width - RIGHT - 12), TOP + h + 3);
     context.save();
@@ -249,7 +260,7 @@
     let pen = false;
     for (let i = 0; i < n; i++) {
       const v = chart.values[i];
-      if (v === null || (pen && data.time[i] - data.time[i - 1] > 0.5)) pen = false;
+      if (v === null || begins.has(i) || (pen && data.time[i] - data.time[i - 1] > 0.5)) pen = false;
       if (v === null) continue;
       if (pen) context.lineTo(x(data.time[i]), y(v * chart.factor)); else context.moveTo(x(data.time[i]), y(v * chart.factor));
       pen = true;
@@ -262,7 +273,7 @@
     if (cursor >= 0) {
       const cx = x(data.time[cursor]), v = chart.values[cursor];
       context.strokeStyle = INK; context.lineWidth = 1; context.beginPath(); context.moveTo(cx, TOP); context.lineTo(cx, TOP + h); context.stroke();
-      text += "   frame " + cursor + ", " + data.time[cursor].toFixed(2) + " s: " + (v === null ? (data.state[cursor] === 0 ? "lost" : "-") : (v * chart.factor).toFixed(chart.digits)) + (doubtful.has(cursor) ? ", doubtful" : "");
+      text += "   frame " + cursor + ", " + moment(cursor) + ": " + (v === null ? (data.state[cursor] === 0 ? "lost" : "-") : (v * chart.factor).toFixed(chart.digits)) + (doubtful.has(cursor) ? ", doubtful" : "");
     }
     context.fillText(text, LEFT, 4);
   };

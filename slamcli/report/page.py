@@ -18,7 +18,7 @@ from slamcli.report import doubts
 from slamcli.report.pictures import Picture
 from slamcli.report.template import fill, resource, thousands
 
-MOST_TRUTH_POINTS = 6000
+PAUSE = 1.0  # [s] in the charts between two recordings, however long they lie apart
 
 
 @dataclass(frozen=True)
@@ -88,10 +88,11 @@ def _data(content: Content) -> dict[str, Any]:
     error = np.full(len(content.stamp), np.nan)
     if ape is not None:
         error[np.searchsorted(content.stamp, ape.stamp)] = ape.error
-    step = -(-len(content.x_truth) // MOST_TRUTH_POINTS) or 1
     rotation = content.T_lc[:, :3, :3]
     return {
-        "time": _numbers(content.stamp - content.stamp[0], 4),
+        "time": _numbers(_time(content), 4),
+        "starts": content.starts.tolist(),
+        "names": content.names if len(content.starts) > 1 else [],
         "position": [_numbers(content.T_lc[:, k, 3], 4) for k in range(3)],
         "forward": [_numbers(rotation[:, k, 2], 3) for k in range(3)],
         "right": [_numbers(rotation[:, k, 0], 3) for k in range(3)],
@@ -100,10 +101,18 @@ def _data(content: Content) -> dict[str, Any]:
         "features": content.n_features.tolist(),
         "doubtful": np.flatnonzero(content.is_doubtful).tolist(),
         "error": _numbers(error, 6) if ape is not None else [],
-        "truth": [_numbers(content.x_truth[::step, k], 4) for k in range(3)],
+        "truth": [_numbers(content.x_truth[:, k], 4) for k in range(3)],
         "loops": content.loops.tolist(),
         "hasFloor": bool(content.ground is not None and content.ground.is_found),
     }
+
+
+def _time(content: Content) -> np.ndarray:
+    """Return when each frame was taken (F,) [s], one recording soon after the other."""
+    since = content.stamp - content.stamp[0]
+    for first in content.starts[1:]:
+        since[first:] -= since[first] - since[first - 1] - PAUSE
+    return since
 
 
 def _numbers(values: np.ndarray, digits: int) -> list[float | None]:

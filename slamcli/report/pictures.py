@@ -40,7 +40,7 @@ class Picture:
 
 def draw(run: RunDir, content: Content) -> list[Picture]:
     """Draw what the run has."""
-    path = content.T_lc[content.has_pose, :3, 3]
+    path = content.path
     painters = (
         ("densify", "Point cloud", _cloud),
         ("octree", "Octree", _octree),

@@ -45,8 +45,14 @@ def camera_poses(run: RunDir) -> np.ndarray:
 
 
 def camera_path(run: RunDir) -> np.ndarray:
-    """Return the camera centres (F, 3) of every frame in the level frame [m], NaN where lost."""
-    return level_poses(run)[:, :3, 3]
+    """Return the camera centres (N, 3) in the level frame [m], in the order of time; a row of NaN where lost and between recordings."""
+    return np.insert(level_poses(run)[:, :3, 3], beginnings(run)[1:], np.nan, axis=0)
+
+
+def beginnings(run: RunDir) -> np.ndarray:
+    """Return the first frame of each recording of a run (R,), which loop brought into one frame: 0 of one recording."""
+    placed = (run.record("loop") or {}).get("summary", {}).get("recordings", [])
+    return np.cumsum([0] + [row["frames"] for row in placed[:-1]], dtype=np.int64)
 
 
 def level_poses(run: RunDir) -> np.ndarray:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 DOUBTS = "doubts"  # key in a stage's summary
+SEE_REPORT = "; the report shows which"  # ends a finding that names no frame; the report itself says it otherwise
 MANY = 0.2  # share of doubtful frames from which on a run is doubtful as a whole
 # What explains what: streams that hold no measurements look as if depth lay off colour, and either looks like a wrong calibration to the
 # map. Where a grave finding of one line is there, those of the lines below are no news.

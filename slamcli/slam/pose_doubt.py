@@ -106,7 +106,7 @@ def findings(record: Doubt) -> list[Finding]:
     text = f"the poses of {n} of {n_poses} frames are doubtful"
     if contradicted > CONTRADICTED:
         text += f", as other views look through {contradicted:.0%} of what is seen: much moves, or the poses are wrong"
-    return [Finding("poses", f"{text}; the report shows which", is_grave=share >= doubt.MANY)]
+    return [Finding("poses", text + doubt.SEE_REPORT, is_grave=share >= doubt.MANY)]
 
 
 def _on_depth(tracks: Tracks, map_: Map) -> np.ndarray:

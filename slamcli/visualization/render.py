@@ -61,7 +61,7 @@ def draw_cloud(
     """Draw points (N, 3) with colours (N, 3) uint8 at some spacing [m]; returns (H, W, 3) uint8.
 
     normal : (N, 3); points that face away are left out. None draws all.
-    path : (M, 3) positions of the camera, drawn as a line
+    path : (M, 3) positions of the camera, drawn as a line that rows of NaN interrupt
     """
     eye = view if isinstance(view, Eye) else look_at(xyz, view)
     if normal is not None:
@@ -154,8 +154,10 @@ def _canvas(eye: Eye) -> tuple[np.ndarray, np.ndarray]:
 def _finish(image: np.ndarray, z_buffer: np.ndarray, eye: Eye, path: np.ndarray | None) -> np.ndarray:
     if path is not None and len(path):
         pixel = eye.see(np.asarray(path, dtype=np.float64))
-        line = np.rint(pixel[pixel[:, 2] > 0.0, :2]).astype(np.int32)  # NaN, where lost, compares false
-        cv2.polylines(image, [line.reshape(-1, 1, 2)], False, PATH_COLOUR, thickness=2 * OVERSAMPLING, lineType=cv2.LINE_AA)
+        is_seen = pixel[:, 2] > 0.0  # NaN, where the path is interrupted, compares false
+        pieces = np.split(pixel[is_seen, :2], np.cumsum(is_seen)[~is_seen])
+        lines = [np.rint(piece).astype(np.int32).reshape(-1, 1, 2) for piece in pieces if len(piece)]
+        cv2.polylines(image, lines, False, PATH_COLOUR, thickness=2 * OVERSAMPLING, lineType=cv2.LINE_AA)
     size = (eye.width // OVERSAMPLING, eye.height // OVERSAMPLING)
     return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
 

@@ -18,8 +18,10 @@ from slamcli import files
 from slamcli.evaluation import map_verdict
 from slamcli.evaluation.run_content import collect
 from slamcli.report import doubts, make, pictures
+from slamcli.report.page import PAUSE, render
 from slamcli.runs.run_directory import RunDir
 from slamcli.schema import Grid
+from slamcli.slam import doubt
 
 Command = Callable[..., Result]
 LARGEST = 15e6  # bytes
@@ -222,3 +224,35 @@ def test_page_runs_in_a_browser_without_complaint(slamcli: Command, made: finish
     messages = [line for line in said.splitlines() if "CONSOLE" in line]
     assert len(messages) == 1
     assert "charts 2" in messages[0]  # the fake run has no features in any frame: a constant is no chart
+
+
+def test_recordings_follow_one_another_without_the_way_between_them(made: finished.Finished) -> None:
+    """Three of them, an hour apart: charts show no hour, and neither the path nor its length has the jumps between them."""
+    one = collect(RunDir(made.run))
+    n = len(one.stamp)
+    T_lc = np.tile(one.T_lc, (3, 1, 1))
+    T_lc[n : 2 * n, 0, 3] += 100.0  # [m]
+    per_frame = {name: np.tile(getattr(one, name), 3) for name in ("state", "n_inliers", "n_features", "is_doubtful")}
+    stamp = np.concatenate([one.stamp + 3600.0 * k for k in range(3)])
+    starts = n * np.arange(3)
+    content = dataclasses.replace(one, stamp=stamp, T_lc=T_lc, starts=starts, names=["a", "b", "c"], ape={}, ape_of=[], **per_frame)
+    data = Page(render(content, [])).data
+    time = np.array(data["time"])
+    span = one.stamp[-1] - one.stamp[0]
+    assert (np.diff(time) > 0.0).all() and time[-1] == pytest.approx(3 * span + 2 * PAUSE, abs=1e-3)
+    np.testing.assert_allclose(np.diff(time)[: n - 1], np.diff(one.stamp), atol=2e-4)
+    assert data["starts"] == starts.tolist() and data["names"] == ["a", "b", "c"]
+    assert content.seconds == pytest.approx(3 * span)
+    assert np.isnan(content.path[:, 0]).sum() == 2 and len(content.path) == 3 * len(one.path) + 2
+    length = [float(re.search(r"along ([0-9.]+) m", doubts.headline(each)).group(1)) for each in (one, content)]
+    assert length[1] == pytest.approx(3 * length[0], abs=0.21)
+
+
+def test_the_page_does_not_send_its_reader_to_itself(made: finished.Finished) -> None:
+    content = collect(RunDir(made.run))
+    found = doubt.Finding("poses", f"3 of 9 poses are doubtful{doubt.SEE_REPORT}")
+    loop = content.states["loop"]
+    record = {**loop.record, "summary": doubt.joined(loop.record["summary"], [found])}
+    remarks = doubts.remarks(dataclasses.replace(content, states={**content.states, "loop": dataclasses.replace(loop, record=record)}))
+    (text,) = (remark.text for remark in remarks if "3 of 9 poses are doubtful" in remark.text)
+    assert "amber in the charts" in text and "report" not in text

@@ -87,6 +87,10 @@ def test_a_path_is_drawn_over_everything() -> None:
     xyz, rgb, normal = wall(0.0, (20, 20, 20), -1.0)
     image = render.draw_cloud(xyz, rgb, normal, spacing=0.02, view=FRONT, path=path)
     assert render.PATH_COLOUR in colours(image)
+    joined = np.count_nonzero((image == np.array(render.PATH_COLOUR)).all(axis=2))
+    interrupted = np.insert(np.repeat(path, [2, 2], axis=0), 2, np.nan, axis=0)  # stands still, jumps, stands still
+    parted = render.draw_cloud(xyz, rgb, normal, spacing=0.02, view=FRONT, path=interrupted)
+    assert 0 < np.count_nonzero((parted == np.array(render.PATH_COLOUR)).all(axis=2)) < 0.2 * joined
 
 
 def test_pictures_are_the_same_each_time() -> None:
