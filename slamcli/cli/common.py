@@ -1,15 +1,22 @@
 """Options that several commands share."""
 
+from __future__ import annotations
+
 import functools
 import json
 import math
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 from click.shell_completion import CompletionItem
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from slamcli.runs.run_directory import RunDir
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -97,6 +104,24 @@ mount_option = click.option(
     type=Mount(),
     help="Where the camera's body is on the robot's base [m, rad], as a URDF origin; the poses are then the base's.",
 )
+
+
+frame_option = click.option(
+    "--frame", type=click.Choice(["world", "level"]), default="world", show_default=True, help="level: z up, floor at z = 0."
+)
+
+
+def told_in(folder: RunDir, T_wc: np.ndarray, frame: str, mount: tuple[float, ...] | None) -> np.ndarray:
+    """Bring poses (N, 4, 4) of a run's camera, camera to world, into the frame asked for, with a mount as poses of the robot's base."""
+    from slamcli.navigation.robot_pose import base_in_camera
+    from slamcli.schema import Ground
+
+    if frame == "level":
+        ground = folder.load(Ground, "densify")
+        if not ground.is_found:
+            click.echo("Warning: no floor was found in this run, so the level frame is only a guess at which way is up", err=True)
+        T_wc = ground.T_lw @ T_wc
+    return T_wc if mount is None else T_wc @ base_in_camera(mount)
 
 
 class Target(click.Path):

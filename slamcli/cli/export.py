@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from slamcli.cli.common import Target, check_ending, json_option, mount_option, run_option, tell_written
+from slamcli.cli.common import Target, check_ending, frame_option, json_option, mount_option, run_option, tell_written, told_in
 from slamcli.formats import TRAJECTORY_FORMATS
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ LAYOUT_OF = {ending: layout for layout, endings in TRAJECTORY_FORMATS.items() fo
     type=click.Choice(["track", "optimize", "loop"]),
     help="The stage whose trajectory is written; default: the last that has been run.",
 )
-@click.option("--frame", type=click.Choice(["world", "level"]), default="world", show_default=True, help="level: z up, floor at z = 0.")
+@frame_option
 @click.option(
     "--format", "layout", type=click.Choice(list(TRAJECTORY_FORMATS)), help="[default: by OUT's ending]; kitti has no time stamps."
 )
@@ -60,9 +60,8 @@ def export_trajectory(
     """
     from slamcli.evaluation import of_several, trajectory_error
     from slamcli.formats import trajectory as trajectory_file
-    from slamcli.navigation.robot_pose import base_in_camera
     from slamcli.runs.run_directory import RunDir
-    from slamcli.schema import Ground, Trajectory
+    from slamcli.schema import Trajectory
 
     ending = check_ending(out, *LAYOUT_OF, ".g2o")
     folder = RunDir.find(run)
@@ -76,16 +75,10 @@ def export_trajectory(
         trajectory = trajectory_error.sure_part(folder, trajectory)
     if recording is not None:
         trajectory = of_several.part(folder, recording, trajectory)
-    T_wc = trajectory.T_wc
-    if frame == "level":
-        ground = folder.load(Ground, "densify")
-        if not ground.is_found:
-            click.echo("Warning: no floor was found in this run, so the level frame is only a guess at which way is up", err=True)
-        T_wc = ground.T_lw @ T_wc
-    if mount is not None:
-        T_wc = T_wc @ base_in_camera(mount)
+    T_wc = told_in(folder, trajectory.T_wc, frame, mount)
     trajectory_file.writer(layout)(out, Trajectory(stamp=trajectory.stamp, T_wc=T_wc))
-    n, n_frames = len(trajectory.stamp), trajectory_error.frame_count(folder)
+    n = len(trajectory.stamp)
+    n_frames = trajectory_error.frame_count(folder) if recording is None else of_several.frame_count(folder, recording)
     note = "; a KITTI file has no stamps, so its lines are not frame numbers here" if layout == "kitti" and n < n_frames else ""
     tell_written(out, as_json, f"{n} poses of {n_frames} frames{note}", poses=n, frames=n_frames, frame=frame, format=layout)
 

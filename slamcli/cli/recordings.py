@@ -27,6 +27,7 @@ def formats(as_json: bool) -> None:
         click.echo(json.dumps([dict(zip(names, row, strict=True)) for row in rows], indent=1))
     else:
         click.echo(table([[name, title, told, f"[{extra}]" if extra else ""] for name, title, told, extra in rows]))
+        click.echo("[video], [phone]: with pip install 'slamcli[video,phone]'", err=True)
 
 
 @click.command("convert", short_help="Write a recording of any layout in the TUM layout.")

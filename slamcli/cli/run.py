@@ -227,12 +227,18 @@ def _state_object(state: "State") -> dict[str, Any]:
 
 def _state_table(rundir: "RunDir", states: "dict[str, State]") -> str:
     from slamcli.console import table
+    from slamcli.runs.staleness import MISSING
 
     rows = []
     for state in states.values():
         seconds, fps = state.record.get("seconds"), state.record.get("fps")
         times = [f"{seconds:.1f} s" if seconds is not None else "", f"{fps:.1f} fps" if fps else ""]
-        rows.append([state.stage, state.state, *times, state.reason])
+        told, reason = state.state, state.reason
+        if not state.is_fresh and rundir.is_cleaned(state):
+            told, reason = (
+                ("cleaned", "") if told == MISSING else ("kept", "what it was made from was cleaned away: slamcli run makes all anew")
+            )
+        rows.append([state.stage, told, *times, reason])
     return f"{rundir.path}: {rundir.info()['dataset']} ({rundir.info()['root']})\n" + table(rows, right=(2, 3))
 
 

@@ -100,8 +100,8 @@ def complete(
         told = source if str(root) in source else f"{root}: {source}"
         what = f"{root}: no calibration" if not calibration.source else f"{told}: the calibration is not whole"
         raise SlamError(
-            f"{what}: {', '.join(missing)} {'are' if len(missing) > 1 else 'is'} missing; put them into a camera.toml {_place(root)}, set them by "
-            f"-s camera.{missing[0]}=... and so on, or name the camera: --camera {'|'.join(NOMINAL)}"
+            f"{what}: {', '.join(missing)} {'are' if len(missing) > 1 else 'is'} missing; put them into a camera.toml {_place(root)}, or name the "
+            f"camera: --camera {'|'.join(NOMINAL)}; a run takes -s camera.{missing[0]}=... and so on, too"
         )
     if depth_scale is not None:
         values.setdefault("depth_scale", depth_scale)

@@ -35,6 +35,14 @@ def part(run: RunDir, name: str, whole: Trajectory) -> Trajectory:
     return Trajectory(stamp=np.array(recordings.own_stamp[frame[here]]), T_wc=whole.T_wc[here])
 
 
+def frame_count(run: RunDir, name: str) -> int:
+    """Return how many frames one recording of a run has."""
+    number = number_of(run, name)
+    if run.record("extract") is None:
+        return int((run.record("loop") or {"summary": {}})["summary"]["recordings"][number]["frames"])
+    return int(np.diff(run.load(Recordings, "extract").recording_offset)[number])
+
+
 def apes(run: RunDir, whole: Ape, truth: Trajectory) -> list[Ape]:
     """Split the error of a run's trajectory by recording, in its order, under the one alignment.
 

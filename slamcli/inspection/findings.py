@@ -14,6 +14,7 @@ from slamcli.inspection.timing import Timing
 from slamcli.slam import calibration_doubt, stream_doubt
 
 ERROR, WARNING, NOTE = "error", "warning", "note"
+REDUCED = " px are used at "  # of the reader's message that large pictures were made smaller, as is usual
 
 # Thresholds lie between what sound recordings show and what the fault shows; the sound ones measured are TUM fr1_xyz and fr3_teddy.
 BLURRED = 0.60  # blur effect; sound recordings reach 0.58 in their fastest moments, a Gaussian of 2 px starts at 0.60
@@ -45,8 +46,13 @@ class Finding:
 
 def about_lists(dataset: Dataset, times: Timing) -> list[Finding]:
     """Judge what opening the recording put right, gaps, and frames without a partner."""
-    findings = [Finding(WARNING, "lists", message, "the program puts this right; mend the list to be rid of the warning")
-                for message in dataset.warnings if "depth_scale" not in message and "hold no reading" not in message]  # fmt: skip
+    findings = [
+        Finding(NOTE, "size", message)
+        if REDUCED in message
+        else Finding(WARNING, "lists", message, "the program puts this right; mend the list to be rid of the warning")
+        for message in dataset.warnings
+        if "depth_scale" not in message and "hold no reading" not in message
+    ]
     for what, gaps in (("colour", times.gaps), ("depth", times.depth_gaps)):
         if gaps:
             start, length = max(gaps, key=lambda gap: gap[1])
@@ -90,7 +96,7 @@ def about_order(dataset: Dataset, times: Timing, seen: Pictures) -> list[Finding
     has_depth = np.array([bool(path) for path in dataset.depth_name])
     rows = np.flatnonzero(has_depth)
     for what, paths, found in (
-        ("colour", dataset.colour_name, pictures.misplaced(seen.thumbnail, dataset.stamp)),
+        ("colour", dataset.colour_name, pictures.misplaced(_lit(seen), dataset.stamp)),
         ("depth", dataset.depth_name, rows[pictures.misplaced(seen.depth_thumbnail[rows], dataset.depth_stamp[rows])]),
     ):
         if len(found):
@@ -103,6 +109,11 @@ def about_order(dataset: Dataset, times: Timing, seen: Pictures) -> list[Finding
                 )
             )
     return findings
+
+
+def _lit(seen: Pictures) -> np.ndarray:
+    """Return the thumbnails of colour, NaN where the picture is nearly black: a covered lens says nothing of order."""
+    return np.where((seen.mean_grey < TOO_DARK)[:, None, None], np.float32(np.nan), seen.thumbnail)
 
 
 def about_files(dataset: Dataset, seen: Pictures) -> list[Finding]:

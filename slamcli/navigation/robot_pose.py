@@ -45,5 +45,5 @@ def base_pose(T_lc: np.ndarray, T_cb: np.ndarray) -> tuple[float, float, float]:
 def base_off_floor(T_lc: np.ndarray, T_cb: np.ndarray) -> tuple[float, float]:
     """Return height above the floor [m] and tilt [rad] of a robot's base, T_cb (4, 4) base to camera: both small where the mount is right."""
     T_lb = product(T_lc, T_cb)
-    lean = np.linalg.norm(T_lb[:2, 2])
+    lean = np.linalg.norm(T_lb[:2, 2], axis=-1)
     return float(T_lb[2, 3]), float(elementary.arctan2(lean, T_lb[2, 2]))

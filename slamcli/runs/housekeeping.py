@@ -1,5 +1,6 @@
 """Run directories as things on a disk: which there are, what may be cleared away, and one file to take along."""
 
+import io
 import shutil
 import zipfile
 from collections.abc import Iterator, Sequence
@@ -105,7 +106,7 @@ def clean(run: RunDir) -> dict[str, int]:
 def archive(run: RunDir, out: Path, *, skip: Sequence[str] = ()) -> int:
     """Write a run's files to the zip file `out`, all or none; returns how many they are. The same run gives the same bytes.
 
-    skip : stages that are left out
+    skip : stages that are left out; what is unpacked knows that they were, as after `clean`
     """
     if out.resolve().is_relative_to(run.path.resolve()):
         raise SlamError(f"{out}: lies in the run that is to be packed; choose another place")
@@ -115,6 +116,8 @@ def archive(run: RunDir, out: Path, *, skip: Sequence[str] = ()) -> int:
             entry = zipfile.ZipInfo(f"{run.path.resolve().name}/{path.relative_to(run.path).as_posix()}", date_time=EARLIEST)
             entry.compress_type = zipfile.ZIP_DEFLATED
             entry.external_attr = 0o644 << 16
-            with path.open("rb") as source, packed.open(entry, "w", force_zip64=True) as target:
+            is_about = path == run.path / "run.json"
+            text = files.sealed(run.without([name for name in skip if (run.path / name).is_dir()])) if is_about else ""
+            with io.BytesIO(text.encode()) if is_about else path.open("rb") as source, packed.open(entry, "w", force_zip64=True) as target:
                 shutil.copyfileobj(source, target, 1 << 20)
     return len(chosen)

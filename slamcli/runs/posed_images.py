@@ -18,7 +18,8 @@ from slamcli.parallel import ordered_map
 from slamcli.schema import Features, Ground, Map, Tracks, frame_poses
 from slamcli.stages.contract import Stored
 
-JPEG_QUALITY = 95
+JPEG_SETTINGS = (cv2.IMWRITE_JPEG_QUALITY, 95)
+PNG_SETTINGS = (cv2.IMWRITE_PNG_COMPRESSION, 3)
 
 
 @dataclass(frozen=True)
@@ -81,9 +82,8 @@ def write_pictures(
             rgb = dataset.rgb(item[0])
         except BadFrame as error:
             raise SlamError(str(error)) from error
-        _, data = cv2.imencode(
-            Path(item[1]).suffix, rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY, cv2.IMWRITE_PNG_COMPRESSION, 3]
-        )
+        ending = Path(item[1]).suffix
+        _, data = cv2.imencode(ending, rgb[..., ::-1], PNG_SETTINGS if ending == ".png" else JPEG_SETTINGS)
         write_bytes(folder / item[1], data.tobytes())
         return rgb
 

@@ -245,7 +245,7 @@ class RunDir:
 
     def _warn_unless_fresh(self, stage: str) -> None:
         """Say once that a result is not what the run's configuration would give now."""
-        if stage in self._warned or (state := self.states()[stage]).is_fresh or self._is_cleaned(state):
+        if stage in self._warned or (state := self.states()[stage]).is_fresh or self.is_cleaned(state):
             return
         if state.reason not in self._warned:  # of several stages that are stale for one reason, one tells it
             log.warning(
@@ -255,16 +255,20 @@ class RunDir:
 
     def mark_cleaned(self, stage: str) -> None:
         """Remember that a stage was deleted on purpose: what was made from it still stands, and may be exported without a warning."""
-        info = self.info()
-        self._write_info({**info, "cleaned": sorted({*info.get("cleaned", []), stage})})
+        self._write_info(self.without([stage]))
 
-    def _is_cleaned(self, state: State) -> bool:
+    def without(self, stages: Sequence[str]) -> dict[str, Any]:
+        """Return ``run.json`` as it is to be when stages are left out on purpose."""
+        info = self.info()
+        return {**info, "cleaned": sorted({*info.get("cleaned", []), *stages})} if stages else info
+
+    def is_cleaned(self, state: State) -> bool:
         """Tell whether a stage is stale only because stages before it were deleted on purpose."""
         cleaned = self.info().get("cleaned", [])
         if state.stage in cleaned and state.state == staleness.MISSING:
             return True
         needed = state.reason.removeprefix("input: ").partition(" is ")[0]
-        return needed in NAMES and NAMES.index(needed) < NAMES.index(state.stage) and self._is_cleaned(self.states()[needed])
+        return needed in NAMES and NAMES.index(needed) < NAMES.index(state.stage) and self.is_cleaned(self.states()[needed])
 
     def states(
         self,

@@ -60,13 +60,13 @@ def _cost(records: dict[str, Any]) -> list[str]:
 
 
 def next_commands(run: RunDir) -> list[str]:
-    """List the commands that come next for this run, each to be pasted as it is."""
+    """List the commands that come next for this run, each to be pasted as it is; none for a robot where no floor is free."""
     roots = [entry["root"] for entry in run.recordings] or [run.info()["root"]]
     has_truth = any((Path(root) / "groundtruth.txt").is_file() for root in roots)
+    has_floor = (run.record("grid2d") or {"summary": {}})["summary"].get("free", 0) > 0
     which = run.flag
     return [
         *([f"slamcli eval ape {which}"] if has_truth else []),
         f"slamcli report {which}",
-        f"slamcli export-grid map.pgm --png map.png {which}",
-        f"slamcli plan --start first --goal last {which}",
+        *([f"slamcli export-grid map.pgm --png map.png {which}", f"slamcli plan --start first --goal last {which}"] if has_floor else []),
     ]

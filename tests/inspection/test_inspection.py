@@ -5,6 +5,7 @@ import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import faults
@@ -15,7 +16,7 @@ from click.testing import Result
 from slamcli.datasets import depth_unit, open_dataset, silent
 from slamcli.datasets.simulate import simulate
 from slamcli.geometry.depth_registration import Registration
-from slamcli.inspection import ERROR, NOTE, WARNING, Inspection, inspect, pictures, quick_look, registration
+from slamcli.inspection import ERROR, NOTE, WARNING, Inspection, findings, inspect, pictures, quick_look, registration
 
 Command = Callable[..., Result]
 
@@ -110,6 +111,16 @@ def test_order_of_an_even_motion_is_left_alone() -> None:
     assert pictures.misplaced(swapped, stamp).tolist() == [20, 40]
     assert len(pictures.misplaced(np.zeros((60, 24, 32), np.float32), stamp)) == 0
     assert len(pictures.misplaced(np.full((60, 24, 32), np.nan, np.float32), stamp)) == 0
+
+
+def test_a_covered_lens_says_nothing_of_the_order() -> None:
+    """Black pictures are told as black; that they do not follow from their neighbours is no second fault."""
+    rng = np.random.default_rng(2)
+    steps = np.cumsum(rng.normal(0.0, 1.0, (60, 24, 32)), axis=0).astype(np.float32) + 120.0
+    steps[30:35] = 0.0
+    stamp, seen = np.arange(60) / 30.0, SimpleNamespace(thumbnail=steps, mean_grey=steps.mean(axis=(1, 2)))
+    assert len(pictures.misplaced(steps, stamp)) > 0
+    assert len(pictures.misplaced(findings._lit(seen), stamp)) == 0
 
 
 def test_blur_grows_with_blurring_and_a_blank_picture_has_none() -> None:

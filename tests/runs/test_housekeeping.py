@@ -52,6 +52,9 @@ def test_clean_keeps_the_results_and_says_what_it_freed(made, slamcli, tmp_path)
         assert result.exit_code == 0, result.stderr
         assert "Warning" not in result.stderr  # it was cleaned on purpose
     assert slamcli("clean", "-r", "mine").exit_code == 2
+    lines = slamcli("status", "-r", "mine").stdout.splitlines()[1:]
+    assert [line.split()[1] for line in lines[:6]] == ["cleaned"] * 4 + ["kept"] * 2
+    assert "stale" not in "".join(lines)
 
 
 def test_a_missing_stage_that_nobody_cleaned_away_is_still_warned_of(made, slamcli) -> None:
@@ -80,6 +83,10 @@ def test_an_archive_unpacked_elsewhere_is_a_run_again(made, slamcli, here) -> No
     slamcli("archive", "r.zip", "--results", "-r", "mine")
     with zipfile.ZipFile(here / "r.zip") as packed:
         assert {name.split("/")[1] for name in packed.namelist()} == {"config.toml", "run.json", "loop", "densify"}
+        packed.extractall(here / "results")
+    said = slamcli("export-trajectory", "t.txt", "-r", here / "results" / "mine")
+    assert said.exit_code == 0 and "Warning" not in said.stderr  # it was left out on purpose
+    assert "cleaned" not in RunDir.find("mine").info()
 
 
 @pytest.mark.parametrize(

@@ -41,6 +41,18 @@ def test_frames_are_found_where_the_run_has_them(slamcli, room, room_run, tmp_pa
     assert {path: path.stat().st_mtime_ns for path in room_run.rglob("*")} == before
 
 
+def test_it_says_where_the_base_stands_on_the_map(slamcli, room, room_run, tmp_path):
+    again, mount = every_other_frame(room, tmp_path / "again"), "0.1,0,0.3,0,0.2,0"
+    of_base = ("--frame", "level", "--mount", mount)
+    told = slamcli("localize", room_run, again, "--out", tmp_path / "t.txt", *of_base, "--json")
+    slamcli("export-trajectory", tmp_path / "own.txt", "-r", room_run, *of_base)
+    last, own = json.loads(told.stdout)["last"], read_tum(tmp_path / "own.txt").T_wc[38]
+    assert [last["x"], last["y"]] == pytest.approx(own[:2, 3], abs=0.01)
+    assert last["yaw"] == pytest.approx(np.arctan2(own[1, 0], own[0, 0]), abs=0.005)
+    apart = se3.log(se3.inverse(own) @ read_tum(tmp_path / "t.txt").T_wc[-1])
+    assert np.abs(apart).max() < 0.01
+
+
 def test_another_place_is_not_recognized(room_run, tmp_path):
     noise = open_dataset(str(write_recording(tmp_path / "noise", frames=3)))
     with pytest.raises(SlamError, match="no frame was recognized in the map of"):
