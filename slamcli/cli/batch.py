@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from slamcli.cli.common import config_option, json_option, set_option
+from slamcli.cli.common import complete_target, config_option, json_option, set_option
 from slamcli.stages import NAMES
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 @click.command("batch", short_help="Run many recordings on this machine's cores or on a Dask cluster.")
-@click.argument("recordings", nargs=-1, required=True, metavar="RECORDING|LIST.txt...")
+@click.argument("recordings", nargs=-1, required=True, metavar="RECORDING|LIST.txt...", shell_complete=complete_target)
 @click.option("--out", default="runs", show_default=True, metavar="DIR|URL", help="Folder of the runs, one for each recording.")
 @click.option("--cluster", metavar="ADDRESS", help="A Dask scheduler, such as tcp://host:8786. [default: workers on this machine]")
 @click.option("--workers", type=click.IntRange(1, 1024), help="Worker processes on this machine. [default: by its cores and memory]")

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import click
 
-from slamcli.cli.common import Target, check_ending, json_option
+from slamcli.cli.common import Target, check_ending, complete_run, json_option
 
 
 @click.command("compare", short_help="Put several runs side by side.")
-@click.argument("runs", nargs=-1, required=True, metavar="RUN RUN...")
+@click.argument("runs", nargs=-1, required=True, metavar="RUN RUN...", shell_complete=complete_run)
 @click.option("-o", "--out", type=Target(), help="Also write the table as one HTML page.")
 @json_option
 def compare_command(runs: tuple[str, ...], out: Path | None, as_json: bool) -> None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from slamcli.cli.common import Target, json_option, run_option
+from slamcli.cli.common import Target, complete_run, json_option, run_option
 
 if TYPE_CHECKING:
     import numpy as np
@@ -59,7 +59,7 @@ def eval_group() -> None:
 def _trajectory_options(function: Any) -> Any:
     """Add what ape and rpe have in common."""
     for decorator in (
-        click.argument("runs", nargs=-1, metavar="[RUN]..."),
+        click.argument("runs", nargs=-1, metavar="[RUN]...", shell_complete=complete_run),
         run_option,
         click.option(
             "--stage",

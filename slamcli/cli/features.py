@@ -7,11 +7,11 @@ from pathlib import Path
 
 import click
 
-from slamcli.cli.common import Target, json_option
+from slamcli.cli.common import Target, complete_target, json_option
 
 
 @click.command("inspect-features", short_help="Draw plain OpenCV ORB beside our features on one frame.")
-@click.argument("recording")
+@click.argument("recording", shell_complete=complete_target)
 @click.argument("frame", type=click.IntRange(min=0))
 @click.argument("out", type=Target())
 @click.option("--data", metavar="DIR", help="Folder of recordings. [default: $SLAMCLI_DATA, ./data, the user's cache]")

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import click
 
-from slamcli.cli.common import Target, frame_option, json_option, mount_option, told_in
+from slamcli.cli.common import Target, complete_run, complete_target, frame_option, json_option, mount_option, told_in
 
 
 @click.command("localize", short_help="Find a new recording's camera in the map of an old run.")
-@click.argument("run")
-@click.argument("recording")
+@click.argument("run", shell_complete=complete_run)
+@click.argument("recording", shell_complete=complete_target)
 @click.option("--out", default="localized.txt", show_default=True, type=Target(), help="Where the trajectory goes (TUM format).")
 @click.option("--data", metavar="DIR", help="Folder of recordings. [default: $SLAMCLI_DATA, ./data, the user's cache]")
 @frame_option

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from slamcli.cli.common import complete_target, config_option, json_option, recording_options, run_option, set_option
+from slamcli.cli.common import complete_run, complete_target, config_option, json_option, recording_options, run_option, set_option
 from slamcli.stages import NAMES, STAGES, Stage
 
 if TYPE_CHECKING:
@@ -78,7 +78,7 @@ def run_command(
 
 
 @click.command("add")
-@click.argument("run", metavar="RUN")
+@click.argument("run", metavar="RUN", shell_complete=complete_run)
 @click.argument("targets", nargs=-1, required=True, metavar="RECORDING...", shell_complete=complete_target)
 @click.option("--data", metavar="DIR", help="Where recordings lie. [default: $SLAMCLI_DATA, else ./data]")
 @json_option

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from slamcli.cli.common import Target, json_option, recording_options, run_option
+from slamcli.cli.common import Target, complete_target, json_option, recording_options, run_option
 
 if TYPE_CHECKING:
     from slamcli.inspection import Inspection
@@ -18,7 +18,7 @@ BAR = 30  # characters of the longest bar in a histogram
 
 
 @click.command("inspect", short_help="Find what is wrong with a recording before time is spent on it.")
-@click.argument("recording")
+@click.argument("recording", shell_complete=complete_target)
 @click.option("--data", metavar="DIR", help="Folder of recordings. [default: $SLAMCLI_DATA, ./data, the user's cache]")
 @click.option(
     "--depth-scale", type=click.FloatRange(min=0, min_open=True), help="Depth units per metre to assume instead of the recording's own."

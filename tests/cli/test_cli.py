@@ -413,6 +413,10 @@ def test_recordings_runs_configurations_and_settings_are_completed(fake: Path, s
     assert completed("run", incomplete="de") == ["demo"]
     assert completed("run", incomplete="tum/") == ["tum/fr1_desk"]
     assert completed("status", "-r", incomplete="runs/") == ["runs/desk", "runs/latest"]
+    for arguments in (["inspect"], ["convert"], ["batch"], ["inspect-features"], ["localize", "runs/desk"], ["add", "runs/desk"]):
+        assert completed(*arguments, incomplete="de") == ["demo"], arguments
+    for arguments in (["compare"], ["eval", "ape"], ["eval", "rpe"], ["localize"], ["add"]):
+        assert completed(*arguments, incomplete="runs/d") == ["runs/desk"], arguments
     assert completed("run", "--config", incomplete="f") == ["fast"]
     assert completed("run", "-s", incomplete="track.min_") == ["track.min_inliers="]
     assert completed("run", "-s", incomplete="match.method=") == ["match.method=words", "match.method=brute"]
