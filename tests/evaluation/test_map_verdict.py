@@ -115,6 +115,40 @@ def test_walls_that_lie_twice(apart: float) -> None:
     assert 0.5 * apart < verdict.evidence.doubled_by < 1.2 * apart  # walls stand askew to the shift
 
 
+def with_person(ahead: float, frames: set[int]) -> list[np.ndarray]:
+    """Return the drive's depth with somebody so far ahead of the camera in some of the frames."""
+    return [
+        kinect_noise(render(T, boxes=(*FURNITURE, person(T, ahead))), np.random.default_rng(i), far=4.0) if i in frames else image
+        for i, (T, image) in enumerate(zip(ROUND, round_recorded(), strict=True))
+    ]
+
+
+@pytest.mark.parametrize("ahead", [0.9, 1.4, 2.2])
+def test_somebody_who_walks_through_is_no_double(ahead: float) -> None:
+    """On the second round he goes before the camera for a quarter of it, unmasked: in front of walls, but not the walls once more."""
+    images = with_person(ahead, set(range(len(ROUND) // 4)))
+    verdict = judged(np.concatenate([ROUND, ROUND]), round_recorded() + images)
+    assert verdict.findings == ()
+
+
+def test_somebody_who_is_always_there_is_no_double_once_he_is_left_out() -> None:
+    """Before a wall he hides most of it all the way round; `moving` leaves him out, as it does in a run."""
+    images = with_person(0.9, set(range(len(ROUND))))
+    gone = [np.abs(there - empty) > 0.2 for there, empty in zip(images, round_recorded(), strict=True)]
+    assert np.median([mask.mean() for mask in gone]) > 0.1
+    still = [np.where(mask, np.nan, image) for mask, image in zip(gone, images, strict=True)]
+    T_lc = np.concatenate([ROUND, ROUND])
+    assert causes(judged(T_lc, round_recorded() + still)) == []
+    assert causes(judged(T_lc, round_recorded() + images)) == [DOUBLED]  # so much is asked of the mask
+
+
+def person(T_lc: np.ndarray, ahead: float) -> tuple:
+    """Return the box (low, high) [m] of somebody so far ahead of a camera, within the room."""
+    forward = T_lc[:2, 2] / np.linalg.norm(T_lc[:2, 2])
+    x, y = np.clip(T_lc[:2, 3] + ahead * forward, [0.3, 0.3], [7.7, 4.7])
+    return (x - 0.25, y - 0.25, 0.0), (x + 0.25, y + 0.25, 1.8)
+
+
 def test_little_floor_without_a_better_reason() -> None:
     T_lc = np.stack([look_along([6.8, 0.9, 0.7], yaw, 0.5) for yaw in np.linspace(-0.2, 0.2, 8)])
     verdict = judged(T_lc, recorded(T_lc))
