@@ -9,6 +9,7 @@ import numpy as np
 from slamcli import artifacts, files
 from slamcli.calibration.self_calibration import Sensing
 from slamcli.config.options import Config
+from slamcli.depth.coarse_images import CoarseImages
 from slamcli.errors import SlamError
 from slamcli.formats.g2o import write_g2o
 from slamcli.schema import LOST, Closures, DepthTimes, Map, Moving, Recordings, Rests, Timing, Tracks, Words, frame_segments
@@ -26,54 +27,38 @@ from slamcli.stages.camera_file import write_camera
 from slamcli.stages.contract import Inputs, Summary, Tools
 from slamcli.stages.map_outputs import describe_other_segments, save_map, segment_file
 
+FEWEST_KEY_FRAMES = 2  # of a map in which no place can be seen again
+
 
 def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
     """Join map segments and close loops until no new one appears; then look at all key frames and frames again."""
-    words, tracks = inputs.load(Words, "match"), inputs.load(Tracks, "optimize")
-    when, camera = inputs.load(Timing, "optimize"), inputs.camera("optimize")
-    given = inputs.camera()
-    moving = inputs.load(Moving, "track")
-    features, depth = moving_parts.still(inputs, moving)
-    features = measurements.corrected(inputs, features, given, Sensing(camera, when, {}))
+    tracks, when, camera = inputs.load(Tracks, "optimize"), inputs.load(Timing, "optimize"), inputs.camera("optimize")
+    features, depth = moving_parts.still(inputs, inputs.load(Moving, "track"))
+    features = measurements.corrected(inputs, features, inputs.camera(), Sensing(camera, when, {}))
     frames = FrameStore(features, camera, cfg.sensor)
     sparse_map = SparseMap.from_map(features, inputs.load(Map, "optimize"))
-    tried: list[Candidate] = []
-    if cfg.loop.enabled and len(sparse_map.kf) > 2:
-        objection = Jury(sparse_map, depth, frames, cfg.loop).objection if when.is_of_several else no_objection
-        closer = LoopCloser(sparse_map, words, frames, cfg.loop, tools.rng(), progress=tools.progress, objection=objection)
-        tried = closer.close_loops()
+
+    tried = close_loops(inputs, sparse_map, frames, depth, cfg, tools, are_several=when.is_of_several)
     accepted = [c for c in tried if c.is_accepted]
     if accepted and cfg.loop.final_refinement:
-        points = FramePoints(depth, given, cfg.sensor)
-        tracks, _ = final_refinement.refine_all(
-            sparse_map,
-            frames,
-            tracks,
-            cfg.track,
-            depth=DepthEdges(points, when, most=cfg.loop.depth_icp_edges, weight=cfg.loop.depth_icp_weight),
-            iterations=cfg.loop.iterations,
-            progress=tools.progress,
-            workers=tools.workers,
-            stands_still=inputs.load(Rests, "track"),
+        depth_edges = DepthEdges(
+            FramePoints(depth, inputs.camera(), cfg.sensor), when, most=cfg.loop.depth_icp_edges, weight=cfg.loop.depth_icp_weight
         )
+        tracks = look_again(inputs, sparse_map, frames, tracks, depth_edges, cfg, tools)
     map_ = map_segments.anchored(main_first(sparse_map.snapshot(), tracks, cfg.loop.main_segment), tracks)
+
     write_pose_graph(out / "posegraph.g2o", map_.T_wk, loop_pose_graph.build(sparse_map, accepted, cfg.loop))
     write_candidates(out / "candidates.csv", tried)
+    save_map(out, features.stamp, tracks, map_)
     several = place_recordings(inputs, out, tracks, map_) if when.is_of_several else None
     for apart in several.warnings() if several is not None else segments_apart(tracks, map_):
         tools.warn(apart)
-    save_map(out, features.stamp, tracks, map_)
-    moving = moving_parts.find(inputs, tracks, map_, tools, rule=FOR_MAPS) if len(moving.moving) else moving
-    motion = moving_parts.figures(moving)
-    if several is not None:
-        moving = moving_parts.with_gone(inputs, moving, several.recording_of_frame, tracks, map_, tools)
-    artifacts.save(moving, out)
+    moving, motion = find_moving(inputs, tracks, map_, several, tools)
     first = inputs.load(Tracks, "track"), inputs.load(Map, "track")
     doubts = pose_doubt.judge(moving_parts.views(inputs, tracks, map_), moving.moving, first, (tracks, map_))
-    artifacts.save(doubts, out)
-    artifacts.save(when, out)
+    for artifact in (moving, doubts, when, closures_of(accepted)):
+        artifacts.save(artifact, out)
     write_camera(out, camera)
-    artifacts.save(closures_of(accepted), out)
     figures: Summary = {
         "frames": len(features.stamp),
         "candidates": len(tried),
@@ -87,6 +72,49 @@ def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
     if several is not None:
         figures["recordings"] = several.counts()
     return figures | motion | doubt.to_summary(pose_doubt.findings(doubts))
+
+
+def close_loops(
+    inputs: Inputs, sparse_map: SparseMap, frames: FrameStore, depth: CoarseImages, cfg: Config, tools: Tools, *, are_several: bool
+) -> list[Candidate]:
+    """Join the map's segments and close its loops, if that is wanted; returns all candidates with their fate.
+
+    are_several : whether the segments may be of different places, so that joining them is to be justified
+    """
+    if not cfg.loop.enabled or len(sparse_map.kf) <= FEWEST_KEY_FRAMES:
+        return []
+    words = inputs.load(Words, "match")
+    objection = Jury(sparse_map, depth, frames, cfg.loop).objection if are_several else no_objection
+    return LoopCloser(sparse_map, words, frames, cfg.loop, tools.rng(), progress=tools.progress, objection=objection).close_loops()
+
+
+def look_again(
+    inputs: Inputs, sparse_map: SparseMap, frames: FrameStore, tracks: Tracks, depth: DepthEdges, cfg: Config, tools: Tools
+) -> Tracks:
+    """Refine the whole map and every frame, now that places seen again coincide."""
+    refined, _ = final_refinement.refine_all(
+        sparse_map,
+        frames,
+        tracks,
+        cfg.track,
+        depth=depth,
+        iterations=cfg.loop.iterations,
+        progress=tools.progress,
+        workers=tools.workers,
+        stands_still=inputs.load(Rests, "track"),
+    )
+    return refined
+
+
+def find_moving(inputs: Inputs, tracks: Tracks, map_: Map, several: of_several.Placed | None, tools: Tools) -> tuple[Moving, Summary]:
+    """Find what the maps are to leave out: what moves, and what a later recording shows to be gone; returns also how much moves."""
+    moving = inputs.load(Moving, "track")
+    if len(moving.moving):
+        moving = moving_parts.find(inputs, tracks, map_, tools, rule=FOR_MAPS)
+    motion = moving_parts.figures(moving)
+    if several is not None:
+        moving = moving_parts.with_gone(inputs, moving, several.recording_of_frame, tracks, map_, tools)
+    return moving, motion
 
 
 def place_recordings(inputs: Inputs, out: Path, tracks: Tracks, map_: Map) -> of_several.Placed:
