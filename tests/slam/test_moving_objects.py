@@ -15,16 +15,8 @@ from slamcli.depth import icp
 from slamcli.geometry import se3
 from slamcli.schema import Features, Words
 from slamcli.slam import background_motion_kernels, moving_object_kernels, moving_objects
-from slamcli.slam.background_motion import (
-    FLATNESS,
-    SWERVE_COST,
-    SWERVE_M,
-    SWERVE_MOST,
-    BackgroundMotion,
-    Judgement,
-    _steadiest,
-    anchor_frames,
-)
+from slamcli.slam.background_motion import SWERVE_COST, SWERVE_MOST, BackgroundMotion, _steadiest, anchor_frames
+from slamcli.slam.background_step import FLATNESS, SWERVE_M, Judgement
 from slamcli.slam.moving_objects import STEP, Views
 
 FRAMES, RATE, SPEED = 36, 15.0, 0.6
