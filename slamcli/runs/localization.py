@@ -15,7 +15,7 @@ from slamcli.files import scratch
 from slamcli.runs.pipeline import Pipeline
 from slamcli.runs.run_directory import RunDir
 from slamcli.schema import LOST, Features, Map, Matches, Timing, Tracks, Trajectory, Words, trajectory
-from slamcli.slam import final_refinement
+from slamcli.slam import frame_refinement
 from slamcli.slam.depth_tracking import FramePoints
 from slamcli.slam.localizer import KnownMap, Localizer
 from slamcli.slam.place_recognition import PlaceIndex
@@ -101,5 +101,5 @@ def _refine(
     for _ in range(LOOKS):
         moving = replace(when, twist=rolling_shutter.frame_twists(frames.features.stamp, tracks, map_))
         rectified = replace(frames, features=rolling_shutter.rectify(frames.features, moving, frames.camera))
-        tracks = final_refinement.refine_frames(sparse_map, rectified, tracks, config.track, progress, workers=config.run.workers)
+        tracks = frame_refinement.refine_frames(sparse_map, rectified, tracks, config.track, progress, workers=config.run.workers)
     return tracks

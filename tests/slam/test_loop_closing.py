@@ -9,7 +9,7 @@ from scenes import ape, observe, orbit, room_points
 from slamcli.config.options import LoopConfig, SensorConfig, TrackConfig
 from slamcli.geometry import se3
 from slamcli.schema import LOST, frame_poses
-from slamcli.slam import final_refinement, loop_candidates, loop_pose_graph, loop_verification
+from slamcli.slam import final_refinement, frame_refinement, loop_candidates, loop_pose_graph, loop_verification
 from slamcli.slam.loop_candidates import Candidate, Claims
 from slamcli.slam.loop_closing import LoopCloser
 from slamcli.slam.place_recognition import PlaceIndex
@@ -119,7 +119,7 @@ def test_final_refinement_finds_lost_frames_and_keeps_the_rest(turn):
     tracks = replace(tracks, **{name: getattr(tracks, name).copy() for name in ("state", "ref_kf", "T_kc")})
     tracks.state[40:44], tracks.ref_kf[40:44], tracks.T_kc[40:44] = LOST, -1, np.nan
     sparse_map = SparseMap.from_map(scene.features, map_)
-    after = final_refinement.refine_frames(sparse_map, scene.frames(SENSOR), tracks, TrackConfig(), lambda items, *_: items)
+    after = frame_refinement.refine_frames(sparse_map, scene.frames(SENSOR), tracks, TrackConfig(), lambda items, *_: items)
     assert (after.state != LOST).all()
     error = [ape(frame_poses(t, map_), scene.T_gc) for t in (tracks, after)]
     assert 1e-4 < error[1] < error[0] + 0.001
@@ -131,7 +131,7 @@ def test_final_refinement_finds_the_same_with_any_number_of_threads(turn):
     for workers in (1, 2, 4):
         sparse_map = SparseMap.from_map(scene.features, map_)
         look = (sparse_map, scene.frames(SENSOR), tracks, TrackConfig(), lambda items, *_: items)
-        found.append(final_refinement.refine_frames(*look, workers=workers))
+        found.append(frame_refinement.refine_frames(*look, workers=workers))
     assert (found[0].T_kc != tracks.T_kc).any()
     for other in found[1:]:
         for name in ("ref_kf", "T_kc", "state", "n_inliers"):
@@ -146,7 +146,7 @@ def test_final_refinement_matches_key_frames_again_and_the_world_stays_where_it_
     noise[0] = np.eye(4)
     sparse_map.kf.T_wk[:] = sparse_map.kf.T_wk @ noise
     shaken = sparse_map.kf.T_wk.copy()
-    found = final_refinement.refine_frames(sparse_map, scene.frames(SENSOR), tracks, TrackConfig(), lambda items, *_: items)
+    found = frame_refinement.refine_frames(sparse_map, scene.frames(SENSOR), tracks, TrackConfig(), lambda items, *_: items)
     assert (sparse_map.kf.T_wk == shaken).all(), "to refine frames leaves the map as it is"
     seen, landmarks = frame_poses(found, sparse_map.snapshot()), sparse_map.snapshot().lm_xyz
     after = final_refinement.move_key_frames(sparse_map, found)
@@ -165,7 +165,7 @@ def test_a_key_frame_that_depth_held_keeps_its_pose(turn):
     scene, tracks, map_ = turn
     most = int(tracks.n_inliers.max())
     found = [
-        final_refinement.refine_frames(
+        frame_refinement.refine_frames(
             SparseMap.from_map(scene.features, map_), scene.frames(SENSOR), tracks, replace(TrackConfig(), depth_icp_below=least),
             lambda items, *_: items,
         )
