@@ -1,4 +1,6 @@
-"""What the recording itself says about its camera: numbers that all observations share, found together with the map (`estimation/shared_parameters.py`).
+"""What the recording itself says about its camera: numbers that all observations share, found together with the map.
+
+By `estimation/shared_parameters.py`, from what `measurement_derivatives.py` says of each.
 
 A factor on all depth readings stays as it is believed to be: a world, a path and depths that are all stretched alike show the same
 pictures. An offset of inverse depth, as of a sensor whose disparities are off by a constant, bends the world and is found.
@@ -9,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from slamcli.calibration import rolling_shutter
+from slamcli.calibration.measurement_derivatives import TIMES, Predictions, current_value, derivative
 from slamcli.config.options import OptimizeConfig, SensorConfig
 from slamcli.estimation import shared_parameters
 from slamcli.estimation.bundle_problem import Problem
@@ -19,13 +22,9 @@ from slamcli.schema import Features, Timing
 from slamcli.sparse_map import map_adjustment
 from slamcli.sparse_map.sparse_map import SparseMap
 
-TIMES = "readout", "depth_readout", "depth_delay"  # fields of Timing that are looked for
-# Only looked at, never corrected: the share of both focal lengths, and [px] by which depth lies off colour.
-FOCAL, SHIFTS = "focal", ("shift_x", "shift_y")
 SIGNIFICANT = 3.0  # standard deviations
 MOST_KEY_FRAMES = 80  # whose landmarks are asked what they would have changed
 ROWS_AT_ONCE = 1 << 18  # features recalibrated together: the intermediate results of a long recording would fill the memory
-STEP = 1e-3  # of its prior sigma, by which an unknown of the calibration is moved to see what that does
 
 
 @dataclass(frozen=True)
@@ -86,7 +85,8 @@ def estimate_sensing(
     problem, columns, pivot = asked
     names = list(prior)
     value, centre = (
-        np.array([_number(name, camera, when, pivot) for name in names]) for camera, when in ((now.camera, now.timing), (given, None))
+        np.array([current_value(name, camera, when, pivot=pivot) for name in names])
+        for camera, when in ((now.camera, now.timing), (given, None))
     )
     found = shared_parameters.estimate(problem, columns, prior=centre - value, prior_sigma=np.array(list(prior.values())))
     if found is None:
@@ -112,7 +112,7 @@ class Deviations:
 def deviations(sparse_map: SparseMap, now: Sensing, sensor: SensorConfig, *, prior: dict[str, float]) -> Deviations | None:
     """Find by how much an adjusted map would have numbers changed; None where the map is not determined.
 
-    prior : standard deviations around what is known now: of fields of Timing or Camera, of FOCAL and of SHIFTS
+    prior : standard deviations around what is known now: of fields of Timing or Camera, and of what `measurement_derivatives` knows besides
     Only landmarks count, and in a long recording those of a stretch of MOST_KEY_FRAMES: edges were measured with the numbers in question.
     """
     n = len(sparse_map.kf)
@@ -138,58 +138,6 @@ def _ask(
     T_kw, x_w = sparse_map.T_kw(part.kfs), sparse_map.lm.xyz[part.ids]
     problem = Problem(T_kw, x_w, part.seen, now.camera, part.is_fixed, part.edges, LEAST_SQUARES)
     predicted = problem.in_given_order(problem.predict(problem.start))
-    # What an offset bends is to turn about readings of this depth, so that it changes no size that the depth scale answers for.
-    pivot = float(np.median(predicted[:, 2]))
-    columns = [_column(name, sparse_map.features, part.row, predicted, now, sigma, pivot) for name, sigma in prior.items()]
-    return problem, np.stack(columns, axis=2), pivot
-
-
-def _number(name: str, camera: Camera, when: Timing | None, pivot: float) -> float:
-    """Return the current value of a calibration parameter, or its prior when it has not been estimated (`when` is None).
-
-    The depth scale is that of readings at depth `pivot` [m].
-    """
-    if name == "depth_scale":
-        return camera.depth_scale / (1.0 - camera.inverse_depth_offset * pivot)
-    if hasattr(camera, name):
-        return float(getattr(camera, name))
-    return 0.0 if when is None else float(getattr(when, name))
-
-
-def _column(name: str, features: Features, rows: np.ndarray, predicted: np.ndarray, now: Sensing, sigma: float, pivot: float) -> np.ndarray:
-    """Return by how much the measurements `rows` (O,) grow per unit of an unknown, (O, 3) [px, px, m].
-
-    predicted : (O, 3) [px, px, m] where the map says they should be. Readings themselves would not do for what stretches them: it
-    stretches their errors too, and the least errors are those of the smallest camera.
-    pivot : [m] depth of readings that the offset of inverse depth leaves as they are
-    """
-    if name == FOCAL:
-        both = (("fx", now.camera.fx), ("fy", now.camera.fy))
-        return sum((value * _column(one, features, rows, predicted, now, sigma * value, pivot) for one, value in both), np.zeros(1))
-    column = np.zeros((len(rows), 3))
-    if name in TIMES:
-        moving = rolling_shutter.flow(features, now.timing.twist, now.camera, rows)
-        if name == "readout":
-            column[:, :2] = -moving.px_per_s * moving.share[:, None]
-            column[:, 2] = -moving.slant_per_s * moving.share
-        else:
-            column[:, 2] = -moving.reading_per_s * (moving.share if name == "depth_readout" else 1.0)
-        return column
-    if name in SHIFTS:  # depth is read so far from where it belongs
-        column[:, 2] = -(predicted[:, 2] ** 2) * np.asarray(features.slope[rows, SHIFTS.index(name)], dtype=np.float64)
-        return column
-    if name in ("depth_scale", "inverse_depth_offset"):
-        z, offset = predicted[:, 2], now.camera.inverse_depth_offset
-        read = 1.0 / z - offset  # [1/m] inverse of the readings, before the offset
-        per_inverse = -z * z
-        if name == "depth_scale":
-            column[:, 2] = per_inverse * read / _number(name, now.camera, None, pivot)
-        else:
-            column[:, 2] = per_inverse * (1.0 - read * pivot / (1.0 - offset * pivot))
-        return column
-    # As the focal length changes, predictions move as well: what counts is where the ray points, in pixels of the camera of now.
-    raw, step = now.camera.distort(predicted[:, :2]), STEP * sigma
-    ahead, behind = (replace(now.camera, **{name: getattr(now.camera, name) + d}) for d in (step, -step))
-    focal = np.array([now.camera.fx, now.camera.fy])
-    column[:, :2] = (ahead.normalize(raw) - behind.normalize(raw)) * focal / (2.0 * step)
-    return column
+    seen = Predictions(sparse_map.features, part.row, predicted, now.camera, now.timing)
+    columns = [derivative(name, seen, sigma=sigma) for name, sigma in prior.items()]
+    return problem, np.stack(columns, axis=2), seen.pivot

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from slamcli import artifacts
-from slamcli.calibration import rolling_shutter, self_calibration
+from slamcli.calibration import measurement_derivatives, rolling_shutter, self_calibration
 from slamcli.calibration.self_calibration import Sensing
 from slamcli.config.options import Config
 from slamcli.schema import Features, Map, Moving, Rests, Timing, Tracks
@@ -95,7 +95,7 @@ def figures(sensing: Sensing) -> dict:
     """Tell the numbers found with their standard deviations."""
     figures = {}
     for name, sigma in sensing.sigma.items():
-        is_time = name in self_calibration.TIMES
+        is_time = name in measurement_derivatives.TIMES
         unit = 1e3 if is_time else 1.0
         value = getattr(sensing.timing if is_time else sensing.camera, name)
         figures[f"{name}_ms" if is_time else name] = [float(f"{unit * one:.6g}") for one in (float(value), sigma)]

@@ -7,7 +7,7 @@ import pytest
 from scene_run import Run
 from scenes import CAMERA, Scene, ape, observe, orbit, room_points
 
-from slamcli.calibration import rolling_shutter, self_calibration
+from slamcli.calibration import measurement_derivatives, rolling_shutter, self_calibration
 from slamcli.calibration.self_calibration import Sensing
 from slamcli.config.options import OptimizeConfig, SensorConfig
 from slamcli.geometry import se3
@@ -85,7 +85,7 @@ def test_timing_that_was_put_in_is_found_within_its_sigma():
 
 def test_what_does_not_differ_from_what_was_believed_stays(scene):
     found = look(scene, scene.features, CAMERA, OptimizeConfig(intrinsics=True))
-    assert found.camera == CAMERA and all(getattr(found.timing, name) == 0.0 for name in self_calibration.TIMES)
+    assert found.camera == CAMERA and all(getattr(found.timing, name) == 0.0 for name in measurement_derivatives.TIMES)
     assert all(sigma > 0.0 for sigma in found.sigma.values()) and len(found.sigma) == 7
 
 
@@ -168,7 +168,7 @@ def test_times_that_are_not_looked_for_stay(scene):
     ):
         found = look(scene, shaken, CAMERA, option, rounds=1)
         assert set(found.sigma) == sought
-        assert all(getattr(found.timing, name) == 0.0 for name in set(self_calibration.TIMES) - sought)
+        assert all(getattr(found.timing, name) == 0.0 for name in set(measurement_derivatives.TIMES) - sought)
 
 
 @pytest.mark.shows("optimize.focal_prior", "optimize.centre_prior")
