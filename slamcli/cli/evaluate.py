@@ -113,6 +113,7 @@ def ape_command(
                 _record(folder, "ape.json", rows[-1])
     if plot is not None:
         plots.plot_ape(results, plot)
+        click.echo(f"{plot}: errors and paths", err=True)
     flat = [one for row in rows for one in (row, *row.get("recordings", []))]
     click.echo(_json(rows, several=_are_several(runs, stage, other)) if as_json else tables.render(flat, APE_COLUMNS, style))
 
@@ -141,6 +142,7 @@ def rpe_command(
                 _record(folder, "rpe.json", rows[-1])
     if plot is not None:
         plots.plot_rpe(results, plot)
+        click.echo(f"{plot}: errors", err=True)
     flat = [part for row in rows for part in (row, row["per_frame"])]
     click.echo(_json(rows, several=_are_several(runs, stage, other)) if as_json else tables.render(flat, RPE_COLUMNS, style))
 

@@ -11,6 +11,7 @@ from slamcli.config.options import Config
 from slamcli.errors import SlamError
 from slamcli.files import read_bytes, sha256, write_bytes
 
+OTHER_VERSION = " (another version of slamcli made this run; start another one with -r)"
 Records = Mapping[str, Mapping[str, Any]]  # stage.json by stage
 
 SEAL = "# sealed "  # begins the last line of config.toml; the digest of all above it follows
@@ -79,7 +80,10 @@ def _sealed_config(data: bytes, source: str) -> Config:
             f"{source}: not as slamcli wrote it; slamcli run restores it from what the stages recorded, "
             "or takes your changes with -s section.key=value or --config FILE"
         )
-    return toml.parse(text, source=source)
+    try:
+        return toml.parse(text, source=source)
+    except SlamError as error:  # it is whole, so that it is not the user's slip
+        raise SlamError(f"{error}{OTHER_VERSION}") from error
 
 
 def _seal(text: bytes) -> bytes:
@@ -90,7 +94,10 @@ def restored_config(records: Records) -> Config:
     """Put the configuration together that the stages ran with, those that ran last having the last word; else the defaults."""
     config = Config()
     for stage, record in records.items():
-        config = toml.merge(config, record["config"], source=f"{stage}/stage.json")
+        try:
+            config = toml.merge(config, record["config"], source=f"{stage}/stage.json")
+        except SlamError as error:
+            raise SlamError(f"{error}{OTHER_VERSION}") from error
     return config
 
 

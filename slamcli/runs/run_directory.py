@@ -225,7 +225,9 @@ class RunDir:
         """Name the folder of a finished stage, or a file in it; SlamError says how to make it when it is not there."""
         path = self.path.joinpath(stage, *names)
         if not (self.path / stage / "stage.json").exists():
-            raise SlamError(f"{self.path}: {stage} has not been run; try: slamcli run --until {stage} {self.flag}")
+            was_cleaned = stage in self.info().get("cleaned", [])
+            why, remedy = ("was cleaned away", "") if was_cleaned else ("has not been run", f"--until {stage} ")
+            raise SlamError(f"{self.path}: {stage} {why}; try: slamcli run {remedy}{self.flag}")
         if not path.exists():
             raise SlamError(f"{path}: not there; make it with: slamcli {stage} {self.flag}")
         if names:

@@ -16,6 +16,7 @@ from slamcli.cli.main import cli
 from slamcli.config import toml
 from slamcli.config.options import Config
 from slamcli.errors import SlamError
+from slamcli.runs import damage
 from slamcli.runs.pipeline import Inputs, Pipeline
 from slamcli.runs.run_directory import RunDir
 from slamcli.schema import Features
@@ -199,3 +200,13 @@ def test_a_run_of_another_version_is_refused_and_stays_as_it_is(slamcli: Slamcli
         assert result.exit_code == 1
         assert "a run of format 4" in result.stderr.splitlines()[-1]
     assert {path: path.read_bytes() for path in before} == before
+
+
+def test_a_run_with_an_option_of_another_version_says_so(tmp_path: Path) -> None:
+    """The file is whole, so that the user has not mistyped: without a word of the version he would look for his own slip."""
+    text = b"[densify]\nnoise_of_old = 0.5\n"
+    (tmp_path / "config.toml").write_bytes(text + damage._seal(text))
+    with pytest.raises(SlamError, match=r"noise_of_old is not known.*another version of slamcli made this run; start another one with -r"):
+        damage.read_config(tmp_path / "config.toml")
+    with pytest.raises(SlamError, match="another version of slamcli made this run"):
+        damage.restored_config({"densify": {"config": {"densify": {"noise_of_old": 0.5}}}})

@@ -51,6 +51,7 @@ def test_clean_keeps_the_results_and_says_what_it_freed(made, slamcli, tmp_path)
         result = slamcli(*command, "-r", "mine")
         assert result.exit_code == 0, result.stderr
         assert "Warning" not in result.stderr  # it was cleaned on purpose
+    assert "extract was cleaned away; try: slamcli run -r runs/mine" in slamcli("report", "-r", "mine").stderr
     assert slamcli("clean", "-r", "mine").exit_code == 2
     lines = slamcli("status", "-r", "mine").stdout.splitlines()[1:]
     assert [line.split()[1] for line in lines[:6]] == ["cleaned"] * 4 + ["kept"] * 2
