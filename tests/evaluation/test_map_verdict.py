@@ -217,6 +217,8 @@ def test_the_end_of_a_run_tells_start_frames_and_verdict(slamcli, room_run, here
     amber = told.index("amber       floor seen in 0 of 40 views")
     assert told[amber + 1].strip() == "-> tilt the camera down until the floor 1 to 2 m ahead is in the picture"
     made = json.loads(slamcli("run", "-r", "room", "--json").stdout)
+    has_floor = bool((RunDir.find("room").load(Grid, "grid2d").state == 0).any())
+    assert any("slamcli plan" in line for line in made["next"]) == has_floor  # no hint that can only fail
     assert made["map"]["findings"][0]["cause"] == NO_FLOOR
     np.testing.assert_allclose(made["frames"]["T_lw"], T_lw)
     assert made["frames"]["first"] == {"x": 0.0, "y": 0.0, "yaw": 0.0}
