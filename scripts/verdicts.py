@@ -53,7 +53,8 @@ CASES = (
     *(Case(f"room {seed}", simulated={"seed": seed}) for seed in range(2, 6)),
     Case("equal walls", simulated={"seed": 5, "alias": "posters"}),
     Case("corridor", simulated={"seed": 1, "alias": "corridor"}),
-    Case("somebody walks", simulated={"seed": 6, "people": 1}),
+    # at 320 x 240 px the poses themselves are 7 cm off, and the map is doubled indeed
+    Case("somebody walks", simulated={"seed": 6, "people": 1, "width": 640, "height": 480, "frames": 240}),
     Case("demo", recording="demo"),
     Case("fr3_teddy", recording="tum/fr3_teddy"),
     Case("fr3_teddy, half", recording="tum/fr3_teddy", settings={"recording.every": 2}),
