@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from slamcli.estimation import pose_kernels as kernels
+from slamcli.estimation.measurements import Measurements
 from slamcli.estimation.minimal_solvers import p3p, rigid3
 from slamcli.estimation.robust_loss import HUBER, Huber
 from slamcli.geometry import se3
@@ -104,29 +105,18 @@ def ransac_rigid(
     return RigidMotion(_matrix(T_ba[best]), is_inlier, _rms(T_ba[best], x_a, ray_b, camera, is_inlier))
 
 
-def refine_pose(
-    T_cw: np.ndarray,
-    x_w: np.ndarray,
-    xy: np.ndarray,
-    depth: np.ndarray,
-    sigma_px: np.ndarray,
-    sigma_z: np.ndarray,
-    camera: Camera,
-    *,
-    loss: Huber = HUBER,
-) -> PoseEstimate:
+def refine_pose(T_cw: np.ndarray, x_w: np.ndarray, measured: Measurements, camera: Camera, *, loss: Huber = HUBER) -> PoseEstimate:
     """Refine a pose by Levenberg-Marquardt on the reprojection and depth residuals of fixed landmarks, (6)-(8).
 
-    T_cw : (4, 4) start; x_w : (N, 3) [m]; xy : (N, 2) [px, undistorted]; depth : (N,) [m], NaN = the pixel alone counts
-    sigma_px, sigma_z : (N,) [px, m] standard deviations of the measurements
+    T_cw : (4, 4) start; x_w : (N, 3) [m]; measured : N rows; where depth or its sigma is NaN, the pixel alone counts
     After each round observations are sorted anew into inliers and outliers by chi2, so an early mistake can be mended; it ends when
     nothing changes. Observations with a value that is not finite are outliers. The loss acts on an observation as a whole; what it begins
     to doubt is an outlier.
     """
     start, is_inlier = se3.orthonormalize(T_cw), np.empty(len(x_w), dtype=np.bool_)
-    measured = (_cast(xy), _cast(depth), _cast(sigma_px), _cast(sigma_z))
+    columns = (_cast(measured.xy), _cast(measured.depth), _cast(measured.sigma_px), _cast(measured.sigma_z))
     T, H, cost, total, rms = kernels.refine(
-        start, _points(x_w), *measured, _intrinsics(camera), *loss, loss.is_robust, ROUNDS, ITERATIONS, is_inlier
+        start, _points(x_w), *columns, _intrinsics(camera), *loss, loss.is_robust, ROUNDS, ITERATIONS, is_inlier
     )
     return PoseEstimate(
         T_cw=T,

@@ -20,6 +20,7 @@ from slamcli.depth.coarse_images import CoarseImages
 from slamcli.depth.icp import OrientedPoints, Pass, PosePrior
 from slamcli.estimation import camera_pose, minimal_solvers
 from slamcli.estimation.camera_pose import PoseEstimate
+from slamcli.estimation.measurements import Measurements
 from slamcli.geometry import se3
 from slamcli.geometry.algebra import product
 from slamcli.geometry.camera import Camera
@@ -54,10 +55,7 @@ class Common:
 
     x_r: np.ndarray  # (N, 3) [m] matched points in the reference
     x_i: np.ndarray  # (N, 3) [m] the same in the frame, NaN where it has no depth
-    xy: np.ndarray  # (N, 2) [px] where the frame sees them
-    depth: np.ndarray  # (N,) [m] there, NaN = none
-    sigma_px: np.ndarray  # (N,)
-    sigma_z: np.ndarray  # (N,) [m]
+    measured: Measurements  # N rows, of the frame, with the noise of both
     weight: np.ndarray  # (N,) [m^2] surface that each stands for
     source: OrientedPoints  # of the reference
     target: OrientedPoints  # of the frame
@@ -138,8 +136,7 @@ class StepFinder:
         return found
 
     def _refined_by_matches(self, T: np.ndarray, common: Common, rows: np.ndarray) -> PoseEstimate:
-        c = common
-        return camera_pose.refine_pose(T, c.x_r[rows], c.xy[rows], c.depth[rows], c.sigma_px[rows], c.sigma_z[rows], self._camera)
+        return camera_pose.refine_pose(T, common.x_r[rows], common.measured.take(rows), self._camera)
 
     def _sampled(self, common: Common) -> list[np.ndarray]:
         """Draw samples of three matches, take the motion that matches of most surface agree on, leave these out, and again."""
@@ -162,8 +159,8 @@ class StepFinder:
 
     def _votes_of(self, common: Common, rows: np.ndarray) -> tuple[np.ndarray, ...]:
         """Gather what the voting kernel takes of matches `rows`."""
-        c = common
-        return c.x_r[rows], c.xy[rows], c.depth[rows], 1.0 / c.sigma_px[rows], 1.0 / c.sigma_z[rows], c.weight[rows], self._pinhole
+        m = common.measured.take(rows)
+        return common.x_r[rows], m.xy, m.depth, 1.0 / m.sigma_px, 1.0 / m.sigma_z, common.weight[rows], self._pinhole
 
     def _common(self, reference: int, i: int) -> Common:
         """Match two frames and gather what both measured."""
@@ -180,10 +177,12 @@ class StepFinder:
         return Common(
             x_r=np.ascontiguousarray(x_r),
             x_i=self._camera.backproject(xy, depth),
-            xy=np.ascontiguousarray(xy),
-            depth=np.ascontiguousarray(depth),
-            sigma_px=np.sqrt(2.0) * measured_i.sigma_px[has],
-            sigma_z=np.sqrt(measured_r.sigma_z[has] ** 2 + np.nan_to_num(measured_i.sigma_z[has]) ** 2),
+            measured=Measurements(
+                xy=np.ascontiguousarray(xy),
+                depth=np.ascontiguousarray(depth),
+                sigma_px=np.sqrt(2.0) * measured_i.sigma_px[has],
+                sigma_z=np.sqrt(measured_r.sigma_z[has] ** 2 + np.nan_to_num(measured_i.sigma_z[has]) ** 2),
+            ),
             weight=cell_rad2 * x_r[:, 2] ** 2 / np.maximum(share, 1),
             source=source,
             target=target,

@@ -7,6 +7,7 @@ import numpy as np
 from slamcli.config.options import TrackConfig
 from slamcli.estimation import camera_pose
 from slamcli.estimation.camera_pose import PoseEstimate
+from slamcli.estimation.measurements import Measurements
 from slamcli.sparse_map import guided_matching
 from slamcli.sparse_map.guided_matching import FrameFeatures, Landmarks, SearchLimits
 
@@ -55,8 +56,8 @@ def _match(T_cw: np.ndarray, landmarks: Landmarks, frame: FrameFeatures, limits:
 
 def refine(T_cw: np.ndarray, x_w: np.ndarray, frame: FrameFeatures, feature: np.ndarray) -> PoseEstimate:
     """Refine a frame's pose on landmarks `x_w` (M, 3) [m, world] seen as its features `feature` (M,)."""
-    xy, depth, sigma_px, sigma_z = (values.take(feature, axis=0) for values in (frame.xy, frame.depth, frame.sigma_px, frame.sigma_z))
-    return camera_pose.refine_pose(T_cw, x_w, xy, depth, sigma_px, sigma_z, frame.camera)
+    measured = Measurements(frame.xy, frame.depth, frame.sigma_px, frame.sigma_z).take(feature)
+    return camera_pose.refine_pose(T_cw, x_w, measured, frame.camera)
 
 
 def search_limits(settings: TrackConfig) -> SearchLimits:

@@ -9,22 +9,13 @@ from slamcli.config.options import SensorConfig
 from slamcli.depth import noise_model
 from slamcli.estimation import bundle_adjustment
 from slamcli.estimation.bundle_problem import Observations
+from slamcli.estimation.measurements import Measurements
 from slamcli.estimation.relative_pose_factors import NO_EDGES, Edges
 from slamcli.geometry import depth_noise, se3
 from slamcli.geometry.algebra import product
 from slamcli.geometry.camera import Camera
 from slamcli.schema import Features
 from slamcli.sparse_map.sparse_map import SparseMap
-
-
-@dataclass(frozen=True)
-class Measurements:
-    """What the features measured, row by row, and how well."""
-
-    xy: np.ndarray  # (O, 2) px, undistorted
-    depth: np.ndarray  # (O,) m, NaN where there is none or it is not trusted
-    sigma_px: np.ndarray  # (O,) px
-    sigma_z: np.ndarray  # (O,) m, NaN where depth is
 
 
 def measure(features: Features, rows: np.ndarray | slice, sensor: SensorConfig) -> Measurements:

@@ -6,6 +6,7 @@ import pytest
 
 from slamcli.estimation import camera_pose, minimal_solvers, pose_kernels
 from slamcli.estimation.bundle_problem import Observations
+from slamcli.estimation.measurements import Measurements
 from slamcli.estimation.robust_loss import HUBER, LEAST_SQUARES, Huber
 from slamcli.geometry import se3
 from slamcli.geometry.camera import Camera
@@ -194,7 +195,7 @@ def test_normal_equations_equal_numerical_derivatives():
 
 def test_without_noise_the_pose_is_exact():
     T_cw, x_w, xy, depth, sigma_px, sigma_z, _ = view(np.random.default_rng(12), 50, noise=0.0)
-    found = camera_pose.refine_pose(se3.exp(np.full(6, 0.03)) @ T_cw, x_w, xy, depth, sigma_px, sigma_z, CAMERA)
+    found = camera_pose.refine_pose(se3.exp(np.full(6, 0.03)) @ T_cw, x_w, Measurements(xy, depth, sigma_px, sigma_z), CAMERA)
     assert np.linalg.norm(distance(found.T_cw, T_cw)) < 1e-7 and found.n_inliers == 50 and found.rms < 1e-4
 
 
@@ -202,7 +203,9 @@ def test_the_error_is_what_the_information_says():
     chi2 = []
     for seed in range(200):
         T_cw, x_w, xy, depth, sigma_px, sigma_z, _ = view(np.random.default_rng(seed), 120)
-        found = camera_pose.refine_pose(se3.exp(np.full(6, 0.01)) @ T_cw, x_w, xy, depth, sigma_px, sigma_z, CAMERA, loss=Huber(30.0, 30.0))
+        found = camera_pose.refine_pose(
+            se3.exp(np.full(6, 0.01)) @ T_cw, x_w, Measurements(xy, depth, sigma_px, sigma_z), CAMERA, loss=Huber(30.0, 30.0)
+        )
         xi = distance(found.T_cw, T_cw)
         chi2.append(xi @ found.information @ xi)
     assert 5.2 < np.mean(chi2) < 6.8  # chi2 of six degrees of freedom: 6 +- 0.25
@@ -213,7 +216,7 @@ def test_outliers_are_told_from_inliers():
     rng = np.random.default_rng(13)
     T_cw, x_w, xy, depth, sigma_px, sigma_z, is_good = view(rng, 1000, outliers=0.3)
     start = se3.exp(np.array([0.02, -0.01, 0.02, 0.01, 0.01, -0.01])) @ T_cw
-    found = camera_pose.refine_pose(start, x_w, xy, depth, sigma_px, sigma_z, CAMERA)
+    found = camera_pose.refine_pose(start, x_w, Measurements(xy, depth, sigma_px, sigma_z), CAMERA)
     xi = distance(found.T_cw, T_cw)
     assert 0.9 < (found.is_inlier & is_good).sum() / is_good.sum() < 0.99
     assert (found.is_inlier & ~is_good).sum() < 0.02 * 1000
@@ -224,14 +227,14 @@ def test_outliers_are_told_from_inliers():
 def test_depth_makes_the_pose_surer():
     T_cw, x_w, xy, depth, sigma_px, sigma_z, _ = view(np.random.default_rng(14), 200, noise=0.0, without_depth=0.0)
     without = np.full(200, np.nan)
-    both = [camera_pose.refine_pose(T_cw, x_w, xy, d, sigma_px, sigma_z, CAMERA).information for d in (depth, without)]
+    both = [camera_pose.refine_pose(T_cw, x_w, Measurements(xy, d, sigma_px, sigma_z), CAMERA).information for d in (depth, without)]
     assert np.linalg.eigvalsh(both[0] - both[1]).min() > -1e-6 * np.abs(both[0]).max()
     assert both[0][2, 2] > 1.5 * both[1][2, 2]
 
 
 def test_without_the_kernel_it_is_least_squares():
     T_cw, x_w, xy, depth, sigma_px, sigma_z, _ = view(np.random.default_rng(20), 30)
-    found = camera_pose.refine_pose(T_cw, x_w, xy, depth, sigma_px, sigma_z, CAMERA, loss=LEAST_SQUARES)
+    found = camera_pose.refine_pose(T_cw, x_w, Measurements(xy, depth, sigma_px, sigma_z), CAMERA, loss=LEAST_SQUARES)
     one = (x_w, Observations(np.zeros(30, dtype=int), np.arange(30), xy, depth, sigma_px, sigma_z), CAMERA)
     best = naive.bundle_cost(found.T_cw[None], *one)
     np.testing.assert_allclose(found.cost, best, rtol=1e-9)
@@ -242,7 +245,9 @@ def test_without_the_kernel_it_is_least_squares():
 def test_an_observation_wrongly_thrown_out_comes_back():
     """From a start 25 px off nearly everything is an outlier at first."""
     T_cw, x_w, xy, depth, sigma_px, sigma_z, _ = view(np.random.default_rng(15), 300)
-    found = camera_pose.refine_pose(se3.exp(np.array([0, 0, 0, 0.05, 0, 0])) @ T_cw, x_w, xy, depth, sigma_px, sigma_z, CAMERA)
+    found = camera_pose.refine_pose(
+        se3.exp(np.array([0, 0, 0, 0.05, 0, 0])) @ T_cw, x_w, Measurements(xy, depth, sigma_px, sigma_z), CAMERA
+    )
     assert 0.9 < found.n_inliers / 300 < 0.99
 
 
@@ -251,14 +256,14 @@ def test_hostile_observations_are_outliers_and_change_nothing():
     T_cw, *columns, _ = view(rng, 100)
     x_w, xy, depth, sigma_px, sigma_z = columns
     start = se3.exp(np.full(6, 0.005)) @ T_cw
-    clean = camera_pose.refine_pose(start, x_w, xy, depth, sigma_px, sigma_z, CAMERA)
+    clean = camera_pose.refine_pose(start, x_w, Measurements(xy, depth, sigma_px, sigma_z), CAMERA)
     behind = se3.transform(se3.inverse(T_cw), np.array([[0.0, 0.0, -1.0], [0.0, 0.0, 0.0]]))
     x_w = np.concatenate([x_w, behind, [[np.nan, 0, 1], [np.inf, 0, 1]], x_w[:2], x_w[2:3]])
     xy = np.concatenate([xy, xy[:4], [[np.nan, 1.0], [1.0, -np.inf]], xy[2:3]])
     depth = np.concatenate([depth, np.ones(7)])
     sigma_px = np.concatenate([sigma_px, np.ones(6), [0.0]])
     sigma_z = np.concatenate([sigma_z, np.ones(7)])
-    found = camera_pose.refine_pose(start, x_w, xy, depth, sigma_px, sigma_z, CAMERA)
+    found = camera_pose.refine_pose(start, x_w, Measurements(xy, depth, sigma_px, sigma_z), CAMERA)
     assert not found.is_inlier[100:].any()
     np.testing.assert_array_equal(found.is_inlier[:100], clean.is_inlier)
     np.testing.assert_allclose(found.T_cw, clean.T_cw, atol=1e-5)
@@ -266,15 +271,15 @@ def test_hostile_observations_are_outliers_and_change_nothing():
 
 def test_a_depth_without_sigma_is_no_depth():
     T_cw, x_w, xy, depth, sigma_px, sigma_z, _ = view(np.random.default_rng(17), 60)
-    a = camera_pose.refine_pose(T_cw, x_w, xy, depth, sigma_px, np.full(60, np.nan), CAMERA)
-    b = camera_pose.refine_pose(T_cw, x_w, xy, np.full(60, np.nan), sigma_px, sigma_z, CAMERA)
+    a = camera_pose.refine_pose(T_cw, x_w, Measurements(xy, depth, sigma_px, np.full(60, np.nan)), CAMERA)
+    b = camera_pose.refine_pose(T_cw, x_w, Measurements(xy, np.full(60, np.nan), sigma_px, sigma_z), CAMERA)
     assert a.T_cw.tobytes() == b.T_cw.tobytes()
 
 
 @pytest.mark.parametrize("n", [0, 1, 2])
 def test_too_few_landmarks_neither_crash_nor_claim_to_know(n):
     T_cw, x_w, xy, depth, sigma_px, sigma_z, _ = view(np.random.default_rng(18), n)
-    found = camera_pose.refine_pose(T_cw, x_w, xy, depth, sigma_px, sigma_z, CAMERA)
+    found = camera_pose.refine_pose(T_cw, x_w, Measurements(xy, depth, sigma_px, sigma_z), CAMERA)
     assert np.isfinite(found.T_cw).all() and found.n_inliers <= n
     assert np.linalg.matrix_rank(found.information, tol=1e-6 * max(1.0, np.abs(found.information).max())) <= 3 * n
 
@@ -282,5 +287,6 @@ def test_too_few_landmarks_neither_crash_nor_claim_to_know(n):
 def test_the_start_is_not_changed_and_float32_columns_are_taken():
     T_cw, *columns, _ = view(np.random.default_rng(19), 50)
     before = T_cw.copy()
-    found = camera_pose.refine_pose(T_cw, *(c.astype(np.float32) for c in columns), CAMERA)
+    x_w, *measured = (c.astype(np.float32) for c in columns)
+    found = camera_pose.refine_pose(T_cw, x_w, Measurements(*measured), CAMERA)
     assert (T_cw == before).all() and found.n_inliers > 40
