@@ -140,8 +140,8 @@ def normals(points: np.ndarray) -> np.ndarray:
     return out
 
 
-def sorted_points(depth, rays, T, corner, stride, above, cell, near, far, low, high, drop, base, quadratic, side):
-    """Band points, their height slices, floor marks, holes and tops per cell, one pixel at a time."""
+def sorted_points(depth, rays, T, corner, stride, above, ground, cell, near, far, low, high, drop, base, quadratic, side):
+    """Band points, their height slices, floor marks, holes and tops per cell, one pixel at a time, heights counted from `ground`."""
     n_band, layers = np.zeros((side, side), int), np.zeros((side, side), np.uint16)
     top, floor, hole = np.zeros((side, side), bool), np.zeros((side, side), int), np.zeros((side, side), int)
 
@@ -167,30 +167,39 @@ def sorted_points(depth, rays, T, corner, stride, above, cell, near, far, low, h
             x = point(v, u)
             slope = (x - T[:3, 3]) / z
             noise = 2.0 * abs(slope[2]) * (base + quadratic * (z - 0.4) ** 2)
+            place = at(x[:2])
+            is_level_here = is_level(v, u, x, slope)
+            x[2] -= ground[place] if place else 0.0
             if x[2] < -drop - noise:
-                reach = T[2, 3] / -slope[2]
-                if reach <= far and (place := at(T[:2, 3] + reach * slope[:2])):
+                height = 0.0
+                for _ in range(4):
+                    reach = (T[2, 3] - height) / -slope[2]
+                    place = at(T[:2, 3] + reach * slope[:2])
+                    before, height = height, float(ground[place]) if place else 0.0
+                    if is_met := abs(height - before) <= low:
+                        break
+                if is_met and reach <= far and place:
                     hole[place] += 1
                 continue
-            place = at(x[:2])
             if z > far or place is None:
                 continue
             if x[2] >= high:
-                top[place] |= x[2] < high + 0.3 and is_level(v, u, x, slope)
+                top[place] |= x[2] < high + 0.3 and is_level_here
             elif x[2] >= low + noise:
                 n_band[place] += 1
                 layers[place] |= np.uint16(1 << int(16 * (x[2] - low) / (high - low)))
-            elif x[2] > -low - noise and is_level(v, u, x, slope):
+            elif x[2] > -low - noise and is_level_here:
                 floor[place] = 2
-                back = min(low - max(x[2], 0.0), T[2, 3] - x[2]) / -slope[2]
+                back = min(low - max(x[2], 0.0), -z * slope[2]) / -slope[2]
                 steps = int(back * np.linalg.norm(slope[:2]) / cell)
                 for s in range(1, steps + 1):
-                    if before := at(x[:2] - back * s / (steps + 1) * slope[:2]):
+                    before = at(x[:2] - back * s / (steps + 1) * slope[:2])
+                    if before and abs(ground[before] - ground[place]) <= low:
                         floor[before] = max(floor[before], 1)
     return n_band, layers, floor, hole, top
 
 
-def crossed_slices(depth, rays, T, corner, stride, cell, near, far, low, high, base, quadratic, side):
+def crossed_slices(depth, rays, T, corner, stride, ground, cell, near, far, low, high, base, quadratic, side):
     """The slices of the band that lines of sight cross, as a set of (row, column, slice), one step along one pixel's line at a time."""
     crossed = set()
     for v in range(stride // 2, depth.shape[0], stride):
@@ -199,7 +208,7 @@ def crossed_slices(depth, rays, T, corner, stride, cell, near, far, low, high, b
             if not near <= z:
                 continue
             slope = T[:3, :3] @ np.array([*rays[v, u].astype(float), 1.0])
-            ends = sorted((edge - T[2, 3]) / slope[2] for edge in (low, high))
+            ends = sorted((edge - T[2, 3]) / slope[2] for edge in (low + min(ground.min(), 0.0), high + max(ground.max(), 0.0)))
             first, last = max(near, ends[0]), min(far, z - 2.0 * (base + quadratic * (z - 0.4) ** 2) - cell, ends[1])
             if not first < last:
                 continue
@@ -208,23 +217,26 @@ def crossed_slices(depth, rays, T, corner, stride, cell, near, far, low, high, b
                 x = T[:3, 3] + t * slope
                 j, i = np.floor(x[:2] / cell - corner).astype(int)
                 if 0 <= i < side and 0 <= j < side:
-                    crossed.add((i, j, int(16 * (x[2] - low) / (high - low))))
+                    k = int(np.floor(16 * (x[2] - ground[i, j] - low) / (high - low)))
+                    if 0 <= k < 16:
+                        crossed.add((i, j, k))
     return crossed
 
 
-def is_clear(standing, is_open, face, around, row, column, camera_x, camera_y, camera_z, low, high, reach):
+def is_clear(standing, is_open, face, around, ground, row, column, camera_x, camera_y, camera_z, low, high, reach):
     """Follow the line from a cell's floor to the camera, looking for something that hangs above it and may reach as far as the cell."""
     start, end = np.array([column + 0.5, row + 0.5]), np.array([camera_x, camera_y])
     steps = int(np.ceil(np.abs(end - start).max()))
     for s in range(steps + 1):
         t = s / steps if steps else 0.0
-        height = t * camera_z
-        if height >= high or t * np.linalg.norm(end - start) > reach:
+        height = ground[row, column] + t * (camera_z - ground[row, column])
+        if height >= high + max(ground.max(), 0.0) or t * np.linalg.norm(end - start) > reach:
             return True
         j, i = np.floor(start + t * (end - start)).astype(int)
         if not (0 <= i < standing.shape[0] and 0 <= j < standing.shape[1]):
             return True
-        if face[i, j] > 0 and around[row, column] != face[i, j]:
+        height -= ground[i, j]
+        if height >= high or (face[i, j] > 0 and around[row, column] != face[i, j]):
             continue
         k = int(16 * max(height - low, 0.0) / (high - low))
         above = {b for b in range(k + 3, 16) if standing[i, j] >> b & 1}

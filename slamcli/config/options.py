@@ -316,6 +316,7 @@ class GridConfig:
     resolution: float = option(0.05, "cell side [m]", gt=0, le=10)
     source: str = option("points", "what the grid is made from: the key frames' depth, or the octree", choices=("points", "octree"))
     band_low: float = option(0.05, "the robot drives over what is lower [m]", ge=0, le=10)
+    max_slope: float = option(8.0, "ramps that are no steeper are floor; 0 = level floor only [degrees]", ge=0, le=45)
     band_high: float = option(0.5, "the robot's height: what is higher is passable [m]", gt=0, le=100)
     drop: float = option(0.08, "an edge: a cell through whose floor something this much deeper was seen [m]", gt=0, le=10)
     spacing: float = option(0.12, "a frame is used when the camera has moved this far since the last [m]", gt=0)
@@ -340,7 +341,7 @@ class GridConfig:
 
 @dataclass(frozen=True)
 class RobotConfig:
-    """The robot that the grid is for, as plan and export-grid need it; its height and what it climbs are grid2d.band_high and band_low."""
+    """The robot that the grid is for, as plan and export-grid need it; its height and what it climbs stand in grid2d."""
 
     radius: float = option(0.2, "radius of the circle that the robot fits into [m]", ge=0, le=100)
     mount: str = option("", "the camera on the robot's base as a URDF origin: x,y,z,roll,pitch,yaw [m, rad]")

@@ -6,12 +6,12 @@ sight passed under nothing that may reach as far as the point. The second pass a
 """
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numba import b1, f8, i4, i8, u2
+from numba import b1, f4, f8, i4, i8, u2
 
 from slamcli.config.options import GridConfig, SensorConfig
 from slamcli.errors import SlamError
@@ -20,6 +20,7 @@ from slamcli.geometry.camera import Camera
 from slamcli.jit.kernel import kernel
 from slamcli.navigation import hanging
 from slamcli.navigation.grid_evidence import NOT_SEEN, SEEN, SLICES, View, look
+from slamcli.navigation.terrain import LEVEL_FLOOR, NO_LEVELS, Surfaces, Terrain, find_terrain
 from slamcli.schema import Grid
 
 MAX_CELLS = 1 << 25  # 290 m x 290 m at 0.05 m: some 600 MB of work arrays
@@ -38,8 +39,29 @@ def build_grid(frames: Iterable[tuple[np.ndarray, np.ndarray]], camera: Camera, 
     Raises SlamError for settings that contradict each other and when the grid would not fit into memory.
     """
     check(settings)
-    rays = np.ascontiguousarray(camera.rays)
-    return fuse((look(depth, rays, T_lk, settings=settings, sensor=sensor) for depth, T_lk in frames), settings=settings)
+    rays, frames = np.ascontiguousarray(camera.rays), list(frames)
+
+    def views(floor: Terrain) -> Iterable[View]:
+        return (look(depth, rays, T_lk, settings=settings, sensor=sensor, floor=floor) for depth, T_lk in frames)
+
+    return fuse_over_floor(views, settings=settings)
+
+
+def fuse_over_floor(views: Callable[[Terrain], Iterable[View]], *, settings: GridConfig) -> Grid:
+    """Fuse the views to one grid; where the floor turns out to slope, look again with heights above it.
+
+    views : gives the views, in order, with heights counted from a floor
+    """
+    surfaces = Surfaces()
+
+    def flat() -> Iterable[View]:
+        for view in views(LEVEL_FLOOR):
+            surfaces.add(view.levels)
+            yield view
+
+    made = fuse(flat(), settings=settings)
+    floor = find_terrain(surfaces.together(), settings=settings, max_cells=MAX_CELLS)
+    return made if floor is None else fuse(views(floor), settings=settings, floor=floor)
 
 
 def check(settings: GridConfig) -> None:
@@ -69,12 +91,12 @@ def spaced(T_lc: np.ndarray, *, metres: float, degrees: float) -> np.ndarray:
     return np.array(chosen, dtype=np.int64)
 
 
-def fuse(views: Iterable[View], *, settings: GridConfig) -> Grid:
-    """Fuse the views, in order, to one grid."""
+def fuse(views: Iterable[View], *, settings: GridConfig, floor: Terrain = LEVEL_FLOOR) -> Grid:
+    """Fuse the views, in order, whose heights are counted from `floor`, to one grid."""
     views, crossings = _without_crossings(views, settings.resolution)
     low, shape = extent(views, settings.resolution)
     standing, is_hole = _standing(views, low, shape, settings), _holes(views, low, shape, settings.resolution)
-    is_open, outline = crossings.open_slices(low, shape), _with_neighbours(standing)
+    is_open, outline, ground = crossings.open_slices(low, shape), _with_neighbours(standing), floor.window(low, shape)
     p_empty = np.full(shape, np.nan, dtype=np.float32)
     n_seen, n_under, n_top = (np.zeros(shape, dtype=np.int32) for _ in range(3))
     sights = [_sight(view, low, settings) for view in views]
@@ -82,7 +104,7 @@ def fuse(views: Iterable[View], *, settings: GridConfig) -> Grid:
     for view, sight in zip(views, sights, strict=True):
         is_floor = (view.floor != NOT_SEEN) & ~is_hole[sight.rows, sight.columns]
         is_free = is_floor.copy()
-        _drop_hidden(is_free, outline, is_open, hangs, nothing, nothing, sight)
+        _drop_hidden(is_free, outline, is_open, hangs, nothing, nothing, ground, sight)
         is_under = is_floor & ~is_free
         n_under[sight.rows[is_under], sight.columns[is_under]] += 1
         n_top[sight.rows[view.is_top], sight.columns[view.is_top]] += 1
@@ -90,7 +112,7 @@ def fuse(views: Iterable[View], *, settings: GridConfig) -> Grid:
     update = paper_update if settings.update == "paper" else evidence_update
     for view, sight in zip(views, sights, strict=True):
         is_free = (view.floor != NOT_SEEN) & ~is_hole[sight.rows, sight.columns]
-        _drop_hidden(is_free, outline, is_open, hangs, things.face, things.around, sight)
+        _drop_hidden(is_free, outline, is_open, hangs, things.face, things.around, ground, sight)
         told = is_free | (view.n_band >= settings.n_low)
         update(p_empty, n_seen, sight.rows[told], sight.columns[told], view.n_band[told], settings)
     p_occupied = (1.0 - p_empty).astype(np.float32)
@@ -126,7 +148,7 @@ def _without_crossings(views: Iterable[View], resolution: float) -> tuple[list[V
     crossings, kept = Crossings(resolution), []
     for view in views:
         crossings.add(view.open_cell, view.open_slices)
-        kept.append(replace(view, open_cell=view.open_cell[:0], open_slices=view.open_slices[:0]))
+        kept.append(replace(view, open_cell=view.open_cell[:0], open_slices=view.open_slices[:0], levels=NO_LEVELS))
     return kept, crossings
 
 
@@ -242,6 +264,7 @@ def _drop_hidden(
     hangs: u2[:, ::1],
     face: i4[:, ::1],
     around: i4[:, ::1],
+    ground: f4[:, ::1],
     sight: CellSights,
 ):
     """Clear `is_free` (N,) of each cell whose floor's line of sight to the camera passes under something that hangs into the band.
@@ -250,24 +273,27 @@ def _drop_hidden(
     through filled slices only grazes the cell's corner, or what stood there has moved. A line may pass over a low box: what is above
     the line beyond the box was open to view. What hangs does not reach as far as the floor's cell if lines of sight crossed that cell at
     its heights, `is_open` (H, W), or if it is the face of a thing (H, W) of known outline that is not `around` it. The slices that hide
-    are added to `hangs` (H, W).
+    are added to `hangs` (H, W). Heights are counted from those of the floor, `ground` (H, W) [m].
     """
     rows, columns, camera_x, camera_y, camera_z, low, high, reach = sight
+    highest = high + max(ground.max(), 0.0)
     for n in range(len(rows)):
         if not is_free[n]:
             continue
         x, y = columns[n] + 0.5, rows[n] + 0.5
         dx, dy = camera_x - x, camera_y - y
+        foot = np.float64(ground[rows[n], columns[n]])
         steps = math.ceil(abs(dx) if abs(dx) > abs(dy) else abs(dy))
         for s in range(steps + 1):
             t = s / steps if steps > 0 else 0.0
-            height = t * camera_z
-            if height >= high or t * t * (dx * dx + dy * dy) > reach * reach:
+            height = foot + t * (camera_z - foot)
+            if height >= highest or t * t * (dx * dx + dy * dy) > reach * reach:
                 break
             i, j = math.floor(y + t * dy), math.floor(x + t * dx)
             if not (0 <= i < standing.shape[0] and 0 <= j < standing.shape[1]):
                 break
-            if standing[i, j]:
+            height -= ground[i, j]
+            if standing[i, j] and height < high:
                 at = int(SLICES * (height - low) / (high - low)) if height > low else 0
                 beside = (31 << at) >> 2  # two slices to either side
                 above = (standing[i, j] >> (at + 3)) << (at + 3)

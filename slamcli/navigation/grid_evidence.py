@@ -13,6 +13,8 @@ from slamcli.errors import SlamError
 from slamcli.geometry import depth_noise, se3
 from slamcli.geometry.depth_noise import DepthNoise
 from slamcli.jit.kernel import kernel
+from slamcli.navigation import terrain
+from slamcli.navigation.terrain import LEVEL_FLOOR, NO_LEVELS, Levels, Terrain
 
 SLICES = 16  # of the band's height, one bit each
 ALL_SLICES = (1 << SLICES) - 1
@@ -25,6 +27,7 @@ LEVEL = 1e-9  # slope of a line of sight that never leaves the height it begins 
 FARTHEST_CELL = 1e8  # cells from the origin: beyond, numbers of cells are no longer exact
 LOWEST, UPRIGHT_SPAN = 16, 12  # of an image's rows: one in so many at its lower edge, and from there up, tell what leaves the picture
 UPRIGHT_SLOPE = 3.0  # height over distance, between the ends of the span, of a surface that is upright
+CROSSINGS = 4  # of a line of sight with a sloping floor: tries to find the cell in which it meets it
 TOP_REACH = 0.3  # [m] above the band: what is seen there from above may be the top of something that reaches into the band
 
 
@@ -41,6 +44,7 @@ class View:
     camera: np.ndarray  # (3,) m, level frame
     open_cell: np.ndarray  # (O, 2) int32, cells that lines of sight crossed within the band
     open_slices: np.ndarray  # (O,) uint16, bits: the slices they crossed
+    levels: Levels = NO_LEVELS  # heights of level surfaces, floor among them
 
 
 class Sight(NamedTuple):
@@ -70,11 +74,20 @@ def blank_cells(side: int) -> Cells:
     return Cells(*(np.zeros((side, side), dtype=of) for of in (np.int32, np.uint16, np.uint8, np.uint8, np.uint8)))
 
 
-def look(depth: np.ndarray, rays: np.ndarray, T_lk: np.ndarray, *, settings: GridConfig, sensor: SensorConfig) -> View:
+def look(
+    depth: np.ndarray,
+    rays: np.ndarray,
+    T_lk: np.ndarray,
+    *,
+    settings: GridConfig,
+    sensor: SensorConfig,
+    floor: Terrain = LEVEL_FLOOR,
+) -> View:
     """Sort one frame's depth into the cells of a window around the camera.
 
     depth : (H, W) float32 [m], NaN = none
     rays : (H, W, 2) float32, of `Camera.rays`
+    floor : heights are counted from it
     """
     cell, half = settings.resolution, int(np.ceil(settings.max_range / settings.resolution)) + 1
     centre = np.floor(T_lk[:2, 3] / cell)
@@ -85,11 +98,12 @@ def look(depth: np.ndarray, rays: np.ndarray, T_lk: np.ndarray, *, settings: Gri
     depth, T_lk = np.ascontiguousarray(depth, dtype=np.float32), np.ascontiguousarray(T_lk, dtype=np.float64)
     sight = Sight(centre - half, cell, settings.min_range, settings.max_range, settings.band_low, settings.band_high, settings.drop)
     noise = noise_model.depth_noise(sensor)
-    _sort_points(depth, rays, T_lk, sight, noise, settings.stride, max(settings.stride, depth.shape[0] // ROWS), seen)
-    _cross(depth, rays, T_lk, sight, noise, OPEN_STRIDE * settings.stride, crossed)
+    first = centre.astype(np.int64) - half
+    ground, above = floor.window(first, (side, side)), max(settings.stride, depth.shape[0] // ROWS)
+    _sort_points(depth, rays, T_lk, sight, noise, settings.stride, above, ground, seen)
+    _cross(depth, rays, T_lk, sight, noise, OPEN_STRIDE * settings.stride, ground, crossed)
     if settings.extend_down:
         _extend_down(depth, rays, T_lk, centre - half, settings, seen.n_band, seen.slices)
-    first = centre.astype(np.int64) - half
     rows, columns = np.nonzero((seen.n_band > 0) | (seen.floor > 0) | (seen.hole >= HOLE_POINTS) | (seen.top > 0))
     open_rows, open_columns = np.nonzero(crossed)
     return View(
@@ -102,12 +116,29 @@ def look(depth: np.ndarray, rays: np.ndarray, T_lk: np.ndarray, *, settings: Gri
         camera=T_lk[:3, 3].copy(),
         open_cell=np.stack([open_columns + first[0], open_rows + first[1]], axis=1).astype(np.int32),
         open_slices=crossed[open_rows, open_columns],
+        levels=_levels(depth, rays, T_lk, sight, OPEN_STRIDE * settings.stride, above) if settings.max_slope > 0.0 else NO_LEVELS,
     )
+
+
+def _levels(depth: np.ndarray, rays: np.ndarray, T_lk: np.ndarray, sight: Sight, stride: int, above: int) -> Levels:
+    """Gather the heights of level surfaces, floor and table tops alike, at every `stride`-th pixel."""
+    most = -(-depth.shape[0] // stride) * -(-depth.shape[1] // stride)
+    cell, height = np.empty((most, 2), dtype=np.int32), np.empty(most)
+    n = _gather_levels(depth, rays, T_lk, sight, stride, above, cell, height)
+    return terrain.add_up(cell[:n], height[:n])
 
 
 @kernel
 def _sort_points(
-    depth: f4[:, ::1], rays: f4[:, :, ::1], T: f8[:, ::1], sight: Sight, noise: DepthNoise, stride: i8, above: i8, seen: Cells
+    depth: f4[:, ::1],
+    rays: f4[:, :, ::1],
+    T: f8[:, ::1],
+    sight: Sight,
+    noise: DepthNoise,
+    stride: i8,
+    above: i8,
+    ground: f4[:, ::1],
+    seen: Cells,
 ):
     """Count band points per cell; mark cells whose floor is seen or over which a line of sight passes below the band, holes, and tops.
 
@@ -117,6 +148,7 @@ def _sort_points(
     under which a robot sees the far floor.
 
     above : rows up to the pixel that tells whether a surface is level
+    ground : (S, S) [m] height of the floor in the cells, from which heights are counted
     """
     corner, cell, near, far, low, high, drop = sight
     n_band, slices, floor, hole, top = seen
@@ -130,56 +162,113 @@ def _sort_points(
             dx = T[0, 0] * rx + T[0, 1] * ry + T[0, 2]
             dy = T[1, 0] * rx + T[1, 1] * ry + T[1, 2]
             dz = T[2, 0] * rx + T[2, 1] * ry + T[2, 2]
-            height = T[2, 3] + z * dz
             slack = NOISE_SIGMAS * abs(dz) * depth_noise.sigma(z, noise)
+            x, y = (T[0, 3] + z * dx) / cell - corner[0], (T[1, 3] + z * dy) / cell - corner[1]
+            height = T[2, 3] + z * dz - _height(ground, x, y)
             if height < -drop - slack and T[2, 3] > 0.0:
-                at = T[2, 3] / -dz
-                j, i = math.floor((T[0, 3] + at * dx) / cell - corner[0]), math.floor((T[1, 3] + at * dy) / cell - corner[1])
-                if at <= far and 0 <= i < side and 0 <= j < side and hole[i, j] < 255:
+                at, is_met = T[2, 3] / -dz, False
+                for _ in range(CROSSINGS):
+                    j, i = math.floor((T[0, 3] + at * dx) / cell - corner[0]), math.floor((T[1, 3] + at * dy) / cell - corner[1])
+                    on_floor = (T[2, 3] - _height(ground, j, i)) / -dz
+                    is_met = abs(on_floor - at) * -dz <= low
+                    if is_met:
+                        break
+                    at = on_floor
+                if is_met and at <= far and 0 <= i < side and 0 <= j < side and hole[i, j] < 255:
                     hole[i, j] += 1
                 continue
             if z > far or height >= high + TOP_REACH:
                 continue
-            x, y = (T[0, 3] + z * dx) / cell - corner[0], (T[1, 3] + z * dy) / cell - corner[1]
             i, j = math.floor(y), math.floor(x)
             if not (0 <= i < side and 0 <= j < side):
                 continue
             if height >= high:
-                if dz < 0.0 and v >= above:
-                    dz2 = T[2, 0] * rays[v - above, u, 0] + T[2, 1] * rays[v - above, u, 1] + T[2, 2]
-                    if abs(T[2, 3] + depth[v - above, u] * dz2 - height) < 0.5 * z * (dz2 - dz):
-                        top[i, j] = 1
+                if dz < 0.0 and v >= above and _is_level(depth, rays, T, u, v, above, z, dz):
+                    top[i, j] = 1
             elif height >= low + slack:
                 n_band[i, j] += 1
                 slices[i, j] |= np.uint16(1 << int(SLICES * (height - low) / (high - low)))
             elif height > -low - slack and dz < 0.0 and v >= above:
                 # The pixel `above` must be as low, or this is the foot of something upright, which noise may have put behind it.
-                z2 = depth[v - above, u]
-                dz2 = T[2, 0] * rays[v - above, u, 0] + T[2, 1] * rays[v - above, u, 1] + T[2, 2]
-                if not (abs(T[2, 3] + z2 * dz2 - height) < 0.5 * z * (dz2 - dz)):
+                if not _is_level(depth, rays, T, u, v, above, z, dz):
                     continue
                 floor[i, j] = SEEN
                 # Back along the ray, as long as it is below the band.
                 rise = low - height if height > 0.0 else low
-                if rise > T[2, 3] - height:
-                    rise = T[2, 3] - height
+                if rise > -z * dz:
+                    rise = -z * dz
                 reach = rise / -dz
                 steps = int(reach * math.sqrt(dx * dx + dy * dy) / cell)
                 for s in range(1, steps + 1):
                     back = reach * s / (steps + 1)
                     i2, j2 = math.floor(y - back * dy / cell), math.floor(x - back * dx / cell)
-                    if 0 <= i2 < side and 0 <= j2 < side and floor[i2, j2] == NOT_SEEN:
+                    is_new = 0 <= i2 < side and 0 <= j2 < side and floor[i2, j2] == NOT_SEEN
+                    if is_new and abs(ground[i2, j2] - ground[i, j]) <= low:  # not over an edge that the floor ends at
                         floor[i2, j2] = PASSED
 
 
 @kernel
-def _cross(depth: f4[:, ::1], rays: f4[:, :, ::1], T: f8[:, ::1], sight: Sight, noise: DepthNoise, stride: i8, crossed: u2[:, ::1]):
+def _height(ground, x, y):
+    """Return the floor's height [m] at a place in cells, 0 outside the window."""
+    i, j = math.floor(y), math.floor(x)
+    return np.float64(ground[i, j]) if 0 <= i < ground.shape[0] and 0 <= j < ground.shape[1] else 0.0
+
+
+@kernel
+def _is_level(depth, rays, T, u, v, above, z, dz):
+    """Say whether the surface at a pixel of depth z rises to the pixel `above` by less than half of what an upright one would."""
+    dz2 = T[2, 0] * rays[v - above, u, 0] + T[2, 1] * rays[v - above, u, 1] + T[2, 2]
+    return abs(depth[v - above, u] * dz2 - z * dz) < 0.5 * z * (dz2 - dz)
+
+
+@kernel
+def _gather_levels(
+    depth: f4[:, ::1],
+    rays: f4[:, :, ::1],
+    T: f8[:, ::1],
+    sight: Sight,
+    stride: i8,
+    above: i8,
+    cells: i4[:, ::1],
+    heights: f8[::1],
+):
+    """Write cell (N, 2), column and row, and height (N,) [m] of each point of a level surface that is seen from above; return their number."""
+    _, cell, near, far, _, _, _ = sight
+    n = 0
+    for v in range(stride // 2, depth.shape[0], stride):
+        for u in range(stride // 2, depth.shape[1], stride):
+            z = depth[v, u]
+            if v < above or not near <= z <= far:
+                continue
+            rx, ry = rays[v, u, 0], rays[v, u, 1]
+            dz = T[2, 0] * rx + T[2, 1] * ry + T[2, 2]
+            if not (dz < 0.0 and _is_level(depth, rays, T, u, v, above, z, dz)):
+                continue
+            cells[n, 0] = math.floor((T[0, 3] + z * (T[0, 0] * rx + T[0, 1] * ry + T[0, 2])) / cell)
+            cells[n, 1] = math.floor((T[1, 3] + z * (T[1, 0] * rx + T[1, 1] * ry + T[1, 2])) / cell)
+            heights[n] = T[2, 3] + z * dz
+            n += 1
+    return n
+
+
+@kernel
+def _cross(
+    depth: f4[:, ::1],
+    rays: f4[:, :, ::1],
+    T: f8[:, ::1],
+    sight: Sight,
+    noise: DepthNoise,
+    stride: i8,
+    ground: f4[:, ::1],
+    crossed: u2[:, ::1],
+):
     """Mark, as bits per cell, the slices of the band that lines of sight cross: up to a cell and the noise before their end, or to `far`.
 
     A reading beyond `far` is too inexact to be a point, but tells that nothing is nearer.
     """
     corner, cell, near, far, low, high, _ = sight
     side = crossed.shape[0]
+    lowest, highest = low + min(ground.min(), 0.0), high + max(ground.max(), 0.0)
     for v in range(stride // 2, depth.shape[0], stride):
         for u in range(stride // 2, depth.shape[1], stride):
             z = depth[v, u]
@@ -193,14 +282,14 @@ def _cross(depth: f4[:, ::1], rays: f4[:, :, ::1], T: f8[:, ::1], sight: Sight, 
             if last > far:
                 last = far
             if abs(dz) > LEVEL:
-                a, b = (low - T[2, 3]) / dz, (high - T[2, 3]) / dz
+                a, b = (lowest - T[2, 3]) / dz, (highest - T[2, 3]) / dz
                 if a > b:
                     a, b = b, a
                 if a > first:
                     first = a
                 if b < last:
                     last = b
-            elif not low <= T[2, 3] < high:
+            elif not lowest <= T[2, 3] < highest:
                 continue
             if not first < last:
                 continue
@@ -210,7 +299,7 @@ def _cross(depth: f4[:, ::1], rays: f4[:, :, ::1], T: f8[:, ::1], sight: Sight, 
                 t = first + (last - first) * (s + 0.5) / (steps + 1)
                 i, j = math.floor((T[1, 3] + t * dy) / cell - corner[1]), math.floor((T[0, 3] + t * dx) / cell - corner[0])
                 if 0 <= i < side and 0 <= j < side:
-                    at = int(SLICES * (T[2, 3] + t * dz - low) / (high - low))
+                    at = math.floor(SLICES * (T[2, 3] + t * dz - ground[i, j] - low) / (high - low))
                     if 0 <= at < SLICES:
                         crossed[i, j] |= np.uint16(1 << at)
 

@@ -17,6 +17,7 @@ from slamcli.navigation import grid, own_body
 from slamcli.navigation.driven import mark_driven
 from slamcli.navigation.grid_evidence import View, look
 from slamcli.navigation.robot_pose import planar_pose
+from slamcli.navigation.terrain import Terrain
 from slamcli.schema import Features, Grid, Ground, Map, Moving, Tracks, frame_poses
 from slamcli.stages.contract import Inputs, Summary, Tools
 from slamcli.stages.depth_frames import PosedFrame, depth_poses, read_depth
@@ -60,22 +61,24 @@ def _from_depth(inputs: Inputs, T_lw: np.ndarray, cfg: Config, tools: Tools) -> 
 
     is_left_out = _left_out(inputs, [poses[row] for row in chosen.tolist()], cfg, tools)
 
-    def look_at(frame: int, depth: np.ndarray, T_ld: np.ndarray) -> View:
-        if is_left_out is not None:
-            depth = np.where(is_left_out, np.float32(np.nan), depth)
-        return look(depth, rays, T_ld, settings=option, sensor=cfg.sensor)
-
-    spaced = tools.progress([poses[row] for row in chosen.tolist()], "grid2d")
     n_views = 0
 
-    def views() -> Iterator[View]:
+    def views(floor: Terrain) -> Iterator[View]:
         """Hand each view on at once: together their lines of sight would fill much memory."""
         nonlocal n_views
+        n_views = 0
+
+        def look_at(frame: int, depth: np.ndarray, T_ld: np.ndarray) -> View:
+            if is_left_out is not None:
+                depth = np.where(is_left_out, np.float32(np.nan), depth)
+            return look(depth, rays, T_ld, settings=option, sensor=cfg.sensor, floor=floor)
+
+        spaced = tools.progress([poses[row] for row in chosen.tolist()], "grid2d")
         for view in read_depth(inputs.dataset, camera, spaced, look_at, moving=moving, workers=tools.workers, warn=tools.warn):
             n_views += 1
             yield view
 
-    return grid.fuse(views(), settings=option), n_views
+    return grid.fuse_over_floor(views, settings=option), n_views
 
 
 def _left_out(inputs: Inputs, poses: list[PosedFrame], cfg: Config, tools: Tools) -> np.ndarray | None:

@@ -128,18 +128,24 @@ def test_an_upright_surface_that_leaves_the_picture_downwards_reaches_the_floor(
     assert (cells(build(T, boxes=(shelf,)), shelf) != OCCUPIED).all()
 
 
+def rolling(side):
+    """A floor that rises and falls by 0.1 m."""
+    i, j = np.mgrid[:side, :side]
+    return (0.1 * np.sin(0.08 * i) * np.cos(0.05 * j)).astype(np.float32)
+
+
 def test_band_points_floor_holes_and_tops_match_their_slow_twin():
     rng = np.random.default_rng(3)
     # From below a level frame that is too high, the floor is a hole and the table reaches just above the band.
-    for height, lift in ((0.6, 0.0), (1.1, -0.2)):
+    for height, lift in ((0.6, 0.0), (0.7, 0.0), (1.1, -0.2)):
         T = look_along([3.9, 0.9, height], 0.7, 0.3)
         depth = kinect_noise(render(T), rng)
         corner, side = np.floor(T[:2, 3] / 0.05) - 85, 171
         T[2, 3] += lift
         sight, noise = Sight(corner, cell=0.05, near=0.5, far=4.0, low=0.05, high=0.5, drop=0.08), READING
-        seen = grid_evidence.blank_cells(side)
-        grid_evidence._sort_points(depth, KINECT.rays, T, sight, noise, 3, 4, seen)
-        expected = naive.sorted_points(depth, KINECT.rays, T, corner, 3, 4, *sight[1:], *noise, side)
+        seen, ground = grid_evidence.blank_cells(side), rolling(side) if height == 0.6 else np.zeros((side, side), np.float32)
+        grid_evidence._sort_points(depth, KINECT.rays, T, sight, noise, 3, 4, ground, seen)
+        expected = naive.sorted_points(depth, KINECT.rays, T, corner, 3, 4, ground, *sight[1:], *noise, side)
         assert seen.n_band.sum() > 100 and (seen.floor.sum() > 100 if lift == 0.0 else min(seen.hole.sum(), seen.top.sum()) > 50)
         for found, twin in zip((*seen[:4], seen.top > 0), expected, strict=True):
             np.testing.assert_array_equal(found, twin)
@@ -151,9 +157,10 @@ def test_crossed_slices_match_their_slow_twin():
     corner, side = np.floor(T[:2, 3] / 0.05) - 85, 171
     sight, noise = Sight(corner, cell=0.05, near=0.5, far=4.0, low=0.05, high=0.5, drop=0.08), READING
     crossed = np.zeros((side, side), np.uint16)
-    grid_evidence._cross(depth, KINECT.rays, T, sight, noise, 5, crossed)
+    ground = rolling(side)
+    grid_evidence._cross(depth, KINECT.rays, T, sight, noise, 5, ground, crossed)
     expected = np.zeros((side, side), np.uint16)
-    for i, j, k in naive.crossed_slices(depth, KINECT.rays, T, corner, 5, *sight[1:-1], *noise, side):
+    for i, j, k in naive.crossed_slices(depth, KINECT.rays, T, corner, 5, ground, *sight[1:-1], *noise, side):
         expected[i, j] |= np.uint16(1 << k)
     assert (crossed > 0).sum() > 300
     np.testing.assert_array_equal(crossed, expected)
@@ -166,12 +173,17 @@ def test_lines_of_sight_match_their_slow_twin():
     rows, columns = (index.ravel() for index in np.mgrid[0:40, 0:50])
     is_open = rng.integers(0, 1 << 16, (40, 50)).astype(np.uint16) | np.where(rng.random((40, 50)) < 0.5, 0xFFFF, 0).astype(np.uint16)
     face, around = (rng.integers(0, 3, (40, 50)).astype(np.int32) * (rng.random((40, 50)) < 0.3) for _ in range(2))
-    for camera in ((10.3, 20.7, 0.6), (-5.0, 60.0, 1.4), (25.5, 20.5, 0.3)):
+    level = np.zeros((40, 50), np.float32)
+    for camera, ground in (((10.3, 20.7, 0.6), level), ((-5.0, 60.0, 1.4), rolling(50)[:40]), ((25.5, 20.5, 0.3), rolling(50)[:40])):
+        ground = np.ascontiguousarray(ground)
         got, hangs = np.arange(len(rows)) % 7 > 0, np.zeros((40, 50), np.uint16)
         was_hidden = ~got
-        grid._drop_hidden(got, standing, is_open, hangs, face, around, grid.CellSights(rows, columns, *camera, 0.05, 0.5, 20.0))
+        grid._drop_hidden(got, standing, is_open, hangs, face, around, ground, grid.CellSights(rows, columns, *camera, 0.05, 0.5, 20.0))
         expected = np.array(
-            [naive.is_clear(standing, is_open, face, around, r, c, *camera, 0.05, 0.5, 20.0) for r, c in zip(rows, columns, strict=True)]
+            [
+                naive.is_clear(standing, is_open, face, around, ground, r, c, *camera, 0.05, 0.5, 20.0)
+                for r, c in zip(rows, columns, strict=True)
+            ]
         )
         np.testing.assert_array_equal(got, expected & ~was_hidden)
         assert 0.15 < np.mean(~got) < 0.98
