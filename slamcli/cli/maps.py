@@ -12,8 +12,9 @@ from slamcli.cli.common import Target, check_ending, json_option, run_option, te
 from slamcli.errors import SlamError
 
 if TYPE_CHECKING:
-    from slamcli.dense.tsdf import Mesh
     from slamcli.runs.run_directory import RunDir
+
+TEXTURED_TRIANGLES = 30_000  # laying more out for a texture takes minutes
 
 out_argument = click.argument("out", type=Target())
 
@@ -92,52 +93,53 @@ def _export_colour_octree(out: Path, folder: RunDir) -> None:
 @click.option(
     "--even-colours/--raw-colours", default=None, help="Even out exposure and white balance. [default: the run's densify.even_colours]"
 )
+@click.option("--texture", is_flag=True, help="Put the images themselves on the surface, not one colour a vertex; .glb and .obj only.")
+@click.option("--texture-size", type=click.IntRange(256, 4096), default=2048, show_default=True, help="Side of the texture [texels].")
 @json_option
 def export_mesh(
-    out: Path, run: str | None, voxel: float, min_area: float, triangles: int | None, even_colours: bool | None, as_json: bool
+    out: Path,
+    run: str | None,
+    voxel: float,
+    min_area: float,
+    triangles: int | None,
+    even_colours: bool | None,
+    texture: bool,
+    texture_size: int,
+    as_json: bool,
 ) -> None:
     """Make a coloured triangle mesh of the key frames' depth and write it to OUT: .glb, .obj or .ply.
 
-    It is in the level frame (z up, metres); a .glb file has y up, as its standard asks.
+    It is in the level frame (z up, metres); a .glb file has y up, as its standard asks. With --texture it has at most 30000 triangles,
+    unless --triangles says otherwise: the picture shows what they do not, and its colours are evened out. An .obj file then comes with a
+    .mtl and a .jpg.
 
     \b
       slamcli export-mesh room.glb
+      slamcli export-mesh room.glb --texture
       slamcli export-mesh fine.ply --voxel 0.01
       slamcli export-mesh light.obj --triangles 50000
     """
     from slamcli.dense import mesh_cleaning
-    from slamcli.formats.mesh import WRITERS
+    from slamcli.formats.mesh import TEXTURE_WRITERS, WRITERS
+    from slamcli.runs.meshing import RunSurface
     from slamcli.runs.run_directory import RunDir
 
     suffix = check_ending(out, *WRITERS)
-    mesh = mesh_cleaning.without_islands(_mesh(RunDir.find(run), voxel, even_colours), min_area=min_area)
-    if triangles is not None:
-        mesh = mesh_cleaning.decimated(mesh, triangles=triangles)
+    if texture and suffix not in TEXTURE_WRITERS:
+        raise SlamError(f"{out}: a {suffix} file has no texture; write .glb or .obj, or leave out --texture")
+    surface = RunSurface(RunDir.find(run), voxel=voxel, even_colours=True if texture and even_colours is None else even_colours)
+    mesh = mesh_cleaning.without_islands(surface.mesh(), min_area=min_area)
+    if triangles is not None or texture:
+        mesh = mesh_cleaning.decimated(mesh, triangles=triangles or TEXTURED_TRIANGLES)
     if not len(mesh.triangle):
         raise SlamError("the mesh is empty: no key frame has depth within densify.depth_max, or every part is smaller than --min-area")
-    WRITERS[suffix](out, mesh.xyz, mesh.triangle, mesh.rgb, mesh.normal)
-    n, size = len(mesh.triangle), out.stat().st_size
-    tell_written(out, as_json, f"{n} triangles", triangles=n, vertices=len(mesh.xyz), frame="level", bytes=size)
-
-
-def _mesh(folder: RunDir, voxel: float, even_colours: bool | None) -> Mesh:
-    from dataclasses import replace
-
-    from slamcli import console
-    from slamcli.dense.tsdf import Volume
-    from slamcli.schema import Ground, Moving
-    from slamcli.stages import densify
-    from slamcli.stages.depth_frames import depth_poses
-
-    config, camera, T_lw = folder.config(), folder.camera("loop"), folder.load(Ground, "densify").T_lw
-    option = replace(config.densify, method="tsdf", voxel=voxel)
-    poses, read = depth_poses(folder), (folder.dataset(), camera)
-    gains, moving = {}, folder.load(Moving, "loop")
-    if option.even_colours if even_colours is None else even_colours:
-        gains = densify.colour_gains(
-            *read, console.progress(poses, "colours"), config.sensor, option, moving=moving, workers=config.run.workers
-        )
-    volume = Volume(camera, voxel=voxel, depth_max=option.depth_max)
-    for view in densify.views(*read, console.progress(poses, "mesh"), config.sensor, option, moving=moving, workers=config.run.workers):
-        volume.add(view.seen, view.evened(gains), view.T_wk)
-    return volume.mesh().moved(T_lw)
+    n, figures = len(mesh.triangle), {"vertices": len(mesh.xyz), "frame": "level"}
+    told = f"{n} triangles"
+    if texture:
+        made, painted = surface.textured(mesh, size=texture_size)
+        TEXTURE_WRITERS[suffix](out, mesh.xyz, mesh.triangle, mesh.normal, made.uv, made.picture)
+        told += f", {painted:.0%} of the surface painted from images"
+        figures["painted"] = round(painted, 4)
+    else:
+        WRITERS[suffix](out, mesh.xyz, mesh.triangle, mesh.rgb, mesh.normal)
+    tell_written(out, as_json, told, triangles=n, bytes=out.stat().st_size, **figures)

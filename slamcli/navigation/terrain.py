@@ -142,8 +142,8 @@ def _steep(height: np.ndarray, of: np.ndarray, settings: GridConfig) -> np.ndarr
     most = elementary.tan(np.radians(settings.max_slope))
     for at in range(0, len(rows), CHUNK):
         part = rows[at : at + CHUNK], columns[at : at + CHUNK]
-        slope = [_median(of_axis[part[0][:, None] + i, part[1][:, None] + j]) for of_axis in (dx, dy)]
-        steep[part] = np.hypot(*slope) > most
+        along, across = (_median(of_axis[part[0][:, None] + i, part[1][:, None] + j]) for of_axis in (dx, dy))
+        steep[part] = along * along + across * across > most * most
     return steep
 
 

@@ -3,6 +3,7 @@
 import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -76,6 +77,30 @@ def test_a_mesh_of_fewer_triangles_is_the_same_surface(slamcli: Callable, known:
         assert len(read.faces) == len(few.faces) and read.area == pytest.approx(few.area, rel=1e-3)
     result = slamcli("export-mesh", tmp_path / "none.ply", *options, "--min-area", 1e6)
     assert result.exit_code == 1 and "--min-area" in result.stderr
+
+
+def test_a_textured_mesh_shows_what_the_cloud_shows(slamcli: Callable, known: RunDir, tmp_path: Path) -> None:
+    trimesh = pytest.importorskip("trimesh")
+    options = ("-r", known.path, "--voxel", 0.05, "--triangles", 800, "--texture", "--texture-size", 512)
+    xyz, rgb, _ = cloud.read_coloured_ply(known.stage_path("densify", "cloud.ply"))
+    for name, axes, sign in (("room.glb", [0, 2, 1], [1, -1, 1]), ("room.obj", [0, 1, 2], [1, 1, 1])):
+        result = slamcli("export-mesh", tmp_path / name, *options)
+        assert result.exit_code == 0 and "painted from images" in result.stderr
+        read = trimesh.load(tmp_path / name, process=False, force="mesh")
+        places, face = trimesh.sample.sample_surface(read, 2000, seed=0)
+        share = trimesh.triangles.points_to_barycentric(read.triangles[face], places)
+        uv = np.einsum("nk,nkd->nd", share, read.visual.uv[read.faces[face]])
+        seen = trimesh.visual.color.uv_to_color(uv, _picture(read.visual.material))
+        distance, row = KDTree(xyz).query(places[:, axes] * sign)
+        off = np.abs(seen[:, :3].astype(float) - rgb[row])[distance < 0.04]
+        assert len(off) > 800 and 0.0 < np.median(off) < 20
+    assert {"room.mtl", "room.jpg"} <= {path.name for path in tmp_path.iterdir()}
+    result = slamcli("export-mesh", tmp_path / "room.ply", *options)
+    assert result.exit_code == 1 and "has no texture" in result.stderr and not (tmp_path / "room.ply").exists()
+
+
+def _picture(material: Any) -> Any:
+    return getattr(material, "baseColorTexture", None) or material.image
 
 
 @pytest.mark.parametrize("what", ["cloud", "octree"])

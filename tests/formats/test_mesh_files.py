@@ -60,3 +60,30 @@ def test_nothing_is_left_of_a_file_that_could_not_be_written(tmp_path: Path) -> 
     with pytest.raises(IndexError):
         mesh.write_glb(tmp_path / "m.glb", XYZ, TRIANGLE, RGB.astype(int) + 300, NORMAL)
     assert not list(tmp_path.iterdir())
+
+
+UV = np.array([[[0.1, 0.2], [0.3, 0.2], [0.1, 0.4]]] * 4, np.float32) + np.arange(4, dtype=np.float32)[:, None, None] * 0.15
+PICTURE = np.kron(np.arange(64, dtype=np.uint8).reshape(8, 8, 1) * np.array([3, 1, 2], np.uint8), np.ones((8, 8, 1), np.uint8))
+
+
+@pytest.mark.parametrize("ending", [".glb", ".obj"])
+def test_trimesh_reads_the_same_picture_at_every_corner(tmp_path: Path, ending: str) -> None:
+    mesh.TEXTURE_WRITERS[ending](tmp_path / f"m{ending}", XYZ, TRIANGLE, NORMAL, UV, PICTURE)
+    read = trimesh.load(tmp_path / f"m{ending}", process=False, force="mesh")
+    corner = read.vertices[read.faces] if ending == ".obj" else read.vertices[read.faces][..., [0, 2, 1]] * [1, -1, 1]
+    np.testing.assert_allclose(corner, XYZ[TRIANGLE], atol=1e-5)
+    uv = read.visual.uv[read.faces] * [1, -1] + [0, 1]  # trimesh counts upwards
+    np.testing.assert_allclose(uv, UV, atol=1e-5)
+    material = read.visual.material
+    picture = np.asarray((material.baseColorTexture if ending == ".glb" else material.image).convert("RGB"))
+    assert picture.shape == PICTURE.shape and np.abs(picture.astype(int) - PICTURE).mean() < 8
+
+
+def test_textured_glb_keeps_to_the_standards_rules(tmp_path: Path) -> None:
+    mesh.write_textured_glb(tmp_path / "m.glb", XYZ, TRIANGLE, NORMAL, UV, PICTURE)
+    about, binary = glb(tmp_path / "m.glb")
+    assert all(view["byteOffset"] % 4 == 0 for view in about["bufferViews"]) and len(binary) == about["buffers"][0]["byteLength"]
+    image = about["bufferViews"][about["images"][0]["bufferView"]]
+    assert "target" not in image and binary[image["byteOffset"] :][:3] == b"\xff\xd8\xff"
+    assert about["materials"][0]["pbrMetallicRoughness"]["baseColorTexture"] == {"index": 0}
+    assert about["accessors"][2]["count"] == len(np.unique(np.column_stack([TRIANGLE.ravel(), UV.reshape(-1, 2)]), axis=0))
