@@ -91,7 +91,9 @@ def _export_colour_octree(out: Path, folder: RunDir) -> None:
 )
 @click.option("--triangles", type=click.IntRange(4), help="Decimate to at most this many.")
 @click.option(
-    "--even-colours/--raw-colours", default=None, help="Even out exposure and white balance. [default: the run's densify.even_colours]"
+    "--even-colours/--raw-colours",
+    default=None,
+    help="Even out exposure, white balance, vignetting. [default: with --texture, or as densify.even_colours]",
 )
 @click.option("--texture", is_flag=True, help="Put the images themselves on the surface, not one colour a vertex; .glb and .obj only.")
 @click.option("--texture-size", type=click.IntRange(256, 4096), default=2048, show_default=True, help="Side of the texture [texels].")

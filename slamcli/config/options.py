@@ -266,7 +266,7 @@ class DensifyConfig(SurfaceConfig):
     voxel: float = option(0.01, "voxel side of the cloud [m]", gt=0, le=1)
     stride: int = option(2, "every stride-th row and column of a depth image is used", ge=1, le=64)
     depth_max: float = option(4.0, "farther readings are ignored [m]", gt=0, le=100)
-    even_colours: bool = option(False, "even out exposure and white balance of key frames; reads every image twice")
+    even_colours: bool = option(False, "even out exposure, white balance and vignetting of key frames; reads images twice")
     min_points: int = option(1, "voxels with fewer readings are dropped", ge=1)
     neighbours: int = option(6, "stray points are found by their mean distance to this many neighbours; 0 keeps all", ge=0, le=100)
     max_deviation: float = option(2.0, "points whose mean distance is this many standard deviations above average are dropped", gt=0)

@@ -1,6 +1,6 @@
 """The surface that a run's key frames saw, with their colours on its vertices or as a texture."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import cached_property
 
@@ -33,7 +33,7 @@ class RunSurface:
         """Integrate the key frames' depth, without what moves, to a surface with coloured vertices."""
         volume = Volume(self._camera, voxel=self._option.voxel, depth_max=self._option.depth_max)
         for view in self._views("mesh"):
-            volume.add(view.seen, view.evened(self._gains), view.T_wk)
+            volume.add(view.seen, view.evened(self._colours), view.T_wk)
         return volume.mesh().moved(self._T_lw)
 
     def textured(self, mesh: Mesh, *, size: int) -> tuple[Textured, float]:
@@ -43,16 +43,16 @@ class RunSurface:
         for view in self._views("texture"):
             middle.append(sharpness(cv2.cvtColor(view.rgb, cv2.COLOR_RGB2GRAY)))
             quality = float(np.clip(middle[-1] / np.median(middle), BLURRED, SHARPEST))
-            painter.add(view.evened(self._gains), view.depth, self._T_lw @ view.T_wk, quality=quality)
+            painter.add(view.evened(self._colours), view.depth, self._T_lw @ view.T_wk, quality=quality)
         return painter.textured(), painter.covered()
 
     @cached_property
-    def _gains(self) -> Mapping[int, np.ndarray]:
+    def _colours(self) -> densify.Colours:
         if not self._is_even:
-            return {}
+            return densify.AS_RECORDED
         config, poses = self._config, console.progress(self._poses, "colours")
         read = self._folder.dataset(), self._camera, poses, config.sensor, self._option
-        return densify.colour_gains(*read, moving=self._moving, workers=config.run.workers)
+        return densify.find_colours(*read, moving=self._moving, workers=config.run.workers)
 
     def _views(self, name: str) -> Iterator[densify.View]:
         config, poses = self._config, console.progress(self._poses, name)

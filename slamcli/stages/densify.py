@@ -31,10 +31,10 @@ def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
     camera, option = inputs.camera("loop"), cfg.densify
     poses = depth_poses(inputs)
     model_w, moving = _model(camera, option), inputs.load(Moving, "loop")
-    gains = (
-        colour_gains(inputs.dataset, camera, tools.progress(poses, "colours"), cfg.sensor, option, moving=moving, workers=tools.workers)
+    colours = (
+        find_colours(inputs.dataset, camera, tools.progress(poses, "colours"), cfg.sensor, option, moving=moving, workers=tools.workers)
         if option.even_colours
-        else {}
+        else AS_RECORDED
     )
     n_used = 0
 
@@ -44,7 +44,7 @@ def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
         every = -(-len(poses) // GROUND_FRAMES)
         timeline = tools.progress(poses, "densify")
         for view in views(inputs.dataset, camera, timeline, cfg.sensor, option, moving=moving, workers=tools.workers, warn=tools.warn):
-            model_w.add(view.seen, view.evened(gains), view.T_wk)
+            model_w.add(view.seen, view.evened(colours), view.T_wk)
             n_used += 1
             if n_used % every == 0:
                 yield view.depth, view.T_wk
@@ -82,6 +82,17 @@ def _model(camera: Camera, option: DensifyConfig) -> Any:
 
 
 @dataclass(frozen=True)
+class Colours:
+    """How key frames' colours are evened out."""
+
+    log_gain: Mapping[int, np.ndarray]  # (3,) by frame
+    shading: np.ndarray  # (H, W, 3) float32, factors against vignetting
+
+
+AS_RECORDED = Colours({}, np.ones((1, 1, 3), np.float32))
+
+
+@dataclass(frozen=True)
 class View:
     """What one key frame sees."""
 
@@ -91,12 +102,13 @@ class View:
     seen: oriented_points.Surface
     rgb: np.ndarray  # (H, W, 3) uint8
 
-    def evened(self, gains: Mapping[int, np.ndarray]) -> np.ndarray:
-        """Return the colours (H, W, 3) uint8 under this frame's gains, as they are where it has none."""
-        return exposure.evened(self.rgb, gains[self.frame]) if self.frame in gains else self.rgb
+    def evened(self, colours: Colours) -> np.ndarray:
+        """Return the colours (H, W, 3) uint8 evened out, as they are where this frame has no gain."""
+        gain = colours.log_gain.get(self.frame)
+        return self.rgb if gain is None else exposure.evened(self.rgb, gain, colours.shading)
 
 
-def colour_gains(
+def find_colours(
     dataset: Dataset,
     camera: Camera,
     poses: Iterable[PosedFrame],
@@ -105,8 +117,8 @@ def colour_gains(
     *,
     moving: Moving = NOTHING,
     workers: int = 1,
-) -> dict[int, np.ndarray]:
-    """Find the gains (3,) of each key frame's colours; frames that cannot be read have none."""
+) -> Colours:
+    """Find what evens out the key frames' colours; frames that cannot be read have no gain."""
     coarse = replace(option, method="voxel", stride=COLOUR_STRIDE)
     frame: list[int] = []
 
@@ -115,8 +127,8 @@ def colour_gains(
             frame.append(view.frame)
             yield view.seen, view.rgb, view.T_wk
 
-    gains = exposure.frame_gains(seen())
-    return dict(zip(frame, gains, strict=True))
+    found = exposure.fit_evening(seen())
+    return Colours(dict(zip(frame, found.gain, strict=True)), found.shading(camera.height, camera.width))
 
 
 def views(
