@@ -139,7 +139,7 @@ def joined_behind_furniture(walls: list[Wall], is_free: Callable[[np.ndarray], n
     while left:
         wall = left.pop(0)
         while (other := next((one for one in left if _go_on(wall, one) and not _is_open(wall, one, is_free)), None)) is not None:
-            left.remove(other)
+            left = [one for one in left if one is not other]
             along = np.array([-wall.normal[1], wall.normal[0]])
             ends = sorted((wall.start, wall.end, other.start, other.end), key=lambda end: float(end @ along))
             wall = replace(wall, start=ends[0], end=ends[-1], top=max(wall.top, other.top))

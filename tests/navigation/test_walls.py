@@ -104,6 +104,14 @@ def test_pieces_of_a_wall_are_one_behind_furniture_and_two_beside_a_door() -> No
     assert len(slit) == 2, "free floor narrower than any door is a gap in the furniture"
 
 
+def test_pieces_are_joined_past_longer_walls_of_other_lines() -> None:
+    pieces = find_walls(
+        *cloud(face([0, 0], [2.5, 0]), face([3.5, 0], [5.0, 0], seed=1), face([5.0, 0], [5.0, 2.0], seed=2)), least_height=1.2
+    )
+    joined = joined_behind_furniture(pieces, lambda places: np.zeros(len(places), bool))
+    assert sorted(wall.length for wall in joined) == pytest.approx([2.0, 5.0], abs=0.03)
+
+
 def test_walls_on_parallel_lines_and_the_two_faces_of_one_stay_apart() -> None:
     walls = find_walls(
         *cloud(face([0, 0], [2.0, 0]), face([2.6, 0.2], [5.0, 0.2], seed=1), face([4.0, -0.02], [2.4, -0.02], seed=2)), least_height=1.2
