@@ -1,11 +1,12 @@
 #!/usr/bin/env python
 """Recordings that are wrong in one way each, and what `run` says of them; and good ones, of which it must say nothing.
 
-    python scripts/wrong_inputs.py OUT [--seed 1] [--size 320 240] [--frames 60] [--cases NAME ...] [--good] [--tum FOLDER]
+    python scripts/wrong_inputs.py OUT [--seed 1] [--size 320 240] [--frames 60] [--cases NAME ...] [--good] [--shift 0] [--tum FOLDER]
 
 A small room is simulated and spoilt in one way after the other. Each line of the table names a case, the finding that puts the run in
 doubt, if its cause is the right one, the error of the poses, and the first words. With --good rooms of many seeds, sizes and kinds
-follow, and with --tum stretches of fr1_xyz and fr3_teddy. OUT keeps recordings and runs, which are used again.
+follow, --shift being added to the seeds, and with --tum stretches of fr1_xyz and fr3_teddy. OUT keeps recordings and runs, which are
+used again.
 """
 
 import argparse
@@ -149,11 +150,12 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=60)
     parser.add_argument("--cases", nargs="*", default=list(CASES), choices=list(CASES), metavar="NAME")
     parser.add_argument("--good", action="store_true", help="also good recordings")
+    parser.add_argument("--shift", type=int, default=0, help="added to the good rooms' seeds [0]")
     parser.add_argument("--tum", type=Path, help="folder of the TUM recordings fr1_xyz and fr3_teddy")
     given = parser.parse_args()
     given.out.mkdir(parents=True, exist_ok=True)
     rows = spoilt(given.out / f"room{given.seed}_{given.size[0]}", given) if given.cases else []
-    rows += good(given.out / "good", given.frames) if given.good else []
+    rows += good(given.out / f"good{given.shift}", given.frames, shift=given.shift) if given.good else []
     rows += recorded(given.out / "tum", given.tum) if given.tum else []
     print(table([HEADINGS, *rows]))
     print(f"{sum(row[2] == 'yes' for row in rows)} of {len(rows)} as they should be")
@@ -173,13 +175,13 @@ def spoilt(home: Path, given: argparse.Namespace) -> list[list[str]]:
     return rows
 
 
-def good(home: Path, frames: int) -> list[list[str]]:
+def good(home: Path, frames: int, *, shift: int = 0) -> list[list[str]]:
     """Run rooms that are as they should be."""
     rows = []
     for k, (name, settings) in enumerate(ROOMS.items()):
         width, height = SIZES[k % len(SIZES)]
         drive = {"frames": frames, "laps": LAPS_PER_FRAME * frames, "width": width, "height": height}
-        rows.append(row(name, room(home / plain(name), {**drive, **settings}), set()))
+        rows.append(row(name, room(home / plain(name), {**drive, **settings, "seed": settings["seed"] + shift}), set()))
     for name, sigma in BLUR.items():
         folder = home / plain(name)
         if not folder.exists():

@@ -36,6 +36,8 @@ SMALL_SHIFT = 3  # px
 BETTER = 1.2  # times the contrast at 1 that another magnification needs,
 STEEPER = 1.05  # times the steepness under the edges at 1, likewise: fewer edges near the centre have more contrast by themselves,
 NOT_ONE = 0.04  # and how far from 1 it must be
+PLAIN_SHIFT, PLAIN_LAG = 1, 0.0201  # px, [s] within which a sound recording's lie
+CLEARLY = 1.04  # times the steepness there that others need: sound recordings reach 1.00, those a frame late have 1.07 and more
 LEAST_LAG_CONTRAST = 1.08  # of the best lag over lags 0.05 s away: below, there was too little motion to tell
 LARGEST_FLOW_SIDE = 320  # px; optical flow is computed on pictures reduced to this width
 
@@ -83,10 +85,10 @@ def measure(dataset: Dataset, *, workers: int, blocks: int = BLOCKS) -> Registra
     lag = _first_guess(colours, edges)
     shift, _ = _best_shift(colours, edges, lag)
     lag, _ = _best_lag(colours, edges, shift)
-    shift, lag = _refine(colours, edges, shift, lag)
+    shift, lag, is_plain = _or_plainer(colours, edges, *_refine(colours, edges, shift, lag))
     lag, lag_contrast = _best_lag(colours, edges, shift)
     shift, shift_contrast = _best_shift(colours, edges, lag)
-    is_shift_sure, is_lag_sure = shift_contrast >= LEAST_CONTRAST, lag_contrast >= LEAST_LAG_CONTRAST
+    is_shift_sure, is_lag_sure = shift_contrast >= LEAST_CONTRAST, lag_contrast >= LEAST_LAG_CONTRAST or not is_plain
     return Registration(
         shift=(float(shift[0]), float(shift[1])) if is_shift_sure else None,
         lag=round(lag, 4) if is_shift_sure and is_lag_sure else None,
@@ -259,6 +261,25 @@ def _refine(colours: Colours, edges: list[Edges], shift: tuple[int, int], lag: f
                 )
                 found[moved, float(t)] = _score(colours, places, *moved)
     return max(found, key=found.__getitem__)
+
+
+def _or_plainer(colours: Colours, edges: list[Edges], shift: tuple[int, int], lag: float) -> tuple[tuple[int, int], float, bool]:
+    """Return the plainest shift and lag that fit about as well as those found: of a sound recording, else of one that is late alone.
+
+    Many pairs fit nearly as well while the picture moves evenly, and the search may end at any of them. The flag says whether they are
+    those of a sound recording.
+    """
+    near, registered = range(-PLAIN_SHIFT, PLAIN_SHIFT + 1), {}
+    for t in LAGS[::2]:
+        places = _at_lag(colours, edges, float(t))
+        registered |= {((dx, dy), float(t)): _score(colours, places, dx, dy) for dx in near for dy in near}
+    plain = {pair: score for pair, score in registered.items() if abs(pair[1]) <= PLAIN_LAG}
+    best, score = (shift, lag), _score(colours, _at_lag(colours, edges, lag), *shift)
+    for plainer in (registered, plain):
+        other = max(plainer, key=plainer.__getitem__)
+        if score <= CLEARLY * plainer[other]:
+            best, score = other, plainer[other]
+    return *best, best in plain
 
 
 def _steps(step: int) -> range:
