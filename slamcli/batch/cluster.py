@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
+from slamcli import files
 from slamcli.batch import storage, worker
 from slamcli.batch.jobs import Job
 from slamcli.console import Progress, Tell, silent
@@ -41,7 +42,11 @@ def local(workers: int, memory: int, *, progress: Progress = silent, tell: Tell 
     compilation.ensure(progress=progress, tell=tell)  # once, and not by every worker at the same time
     options = {"n_workers": workers, "threads_per_worker": 1, "memory_limit": memory, "dashboard_address": None}
     options |= {"silence_logs": logging.CRITICAL}
-    with LocalCluster(processes=True, host="127.0.0.1", **options) as cluster, Client(cluster) as client:
+    with (
+        files.scratch("slamcli-batch-") as folder,
+        LocalCluster(processes=True, host="127.0.0.1", local_directory=str(folder), **options) as cluster,
+        Client(cluster) as client,
+    ):
         yield client
 
 

@@ -1,6 +1,9 @@
 """What a batch is to do: its recordings, where their runs go, and under which settings."""
 
+import contextlib
+import fcntl
 import os
+import platform
 import re
 import uuid
 from collections import Counter
@@ -9,12 +12,14 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from slamcli import files
 from slamcli.batch import storage
 from slamcli.config.options import Config
 from slamcli.errors import SlamError
 from slamcli.stages import NAMES
 
 LIST_SUFFIX = ".txt"
+MARKER = ".batch-"  # begins the names of the files by which workers know a folder again
 
 
 @dataclass(frozen=True)
@@ -103,16 +108,32 @@ def with_threads(order: Order, threads: int) -> Order:
 
 @contextmanager
 def prepared(order: Order) -> Iterator[Order]:
-    """Make the folder of the runs, with a file in it by which workers know the folder again; the file goes with the block."""
+    """Make the folder of the runs, with a file in it by which workers know the folder again.
+
+    The file goes with the block, and so do those that killed batches of this machine left.
+    """
     if storage.is_url(order.out):
         storage.connect(order.out)
         yield order
         return
-    marker = f".batch-{uuid.uuid4().hex[:12]}"
-    Path(order.out).mkdir(parents=True, exist_ok=True)
-    path = Path(order.out) / marker
-    path.touch()
-    try:
-        yield replace(order, marker=marker)
-    finally:
-        path.unlink(missing_ok=True)
+    out = Path(order.out)
+    out.mkdir(parents=True, exist_ok=True)
+    _clear_markers(out)
+    path = out / f"{MARKER}{uuid.uuid4().hex[:12]}"
+    with path.open("xb") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        file.write(os.fsencode(platform.node()))
+        file.flush()
+        try:
+            yield replace(order, marker=path.name)
+        finally:
+            path.unlink(missing_ok=True)
+
+
+def _clear_markers(out: Path) -> None:
+    """Remove the markers of this machine whose processes are dead; of another machine's nobody can tell."""
+    for left in out.glob(f"{MARKER}*"):
+        with contextlib.suppress(OSError), files.open_regular(left) as file:  # locked by one that lives, or removed just now
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if file.read() == os.fsencode(platform.node()):
+                left.unlink()

@@ -43,8 +43,7 @@ def read_text(place: str) -> str:
     """Read a small text file, here or elsewhere; SlamError when it cannot be read."""
     try:
         if not is_url(place):
-            with open(place, encoding="utf-8") as file:
-                text = file.read(LARGEST_TEXT + 1)
+            text = files.read_bytes(place, limit=LARGEST_TEXT).decode("utf-8")
         else:
             system, path = connect(place)
             text = system.cat_file(path, start=0, end=LARGEST_TEXT + 1).decode("utf-8")

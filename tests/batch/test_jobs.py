@@ -2,6 +2,8 @@
 
 import csv
 import io
+import os
+import platform
 from pathlib import Path
 
 import pytest
@@ -90,3 +92,19 @@ def test_the_page_escapes_what_comes_from_outside_counts_and_puts_failures_first
 def test_lines_tell_what_became_of_a_recording() -> None:
     assert figures.as_line(ROWS[0]) == "a: done, 97.5% of 40 frames, APE 0.0041 m, 12.0 s of CPU time, to doubt"
     assert figures.as_line(ROWS[1]).startswith("<script>: failed: rgb.txt: not")
+
+
+def test_markers_of_the_dead_go_and_those_of_the_living_and_of_others_stay(here: Path) -> None:
+    order, out = Order(out=str(here / "runs")), here / "runs"
+    out.mkdir()
+    (out / ".batch-dead").write_text(platform.node())
+    (out / ".batch-elsewhere").write_text("another machine")
+    with jobs.prepared(order) as one, jobs.prepared(order) as two:
+        assert {path.name for path in out.iterdir()} == {one.marker, two.marker, ".batch-elsewhere"}
+    assert [path.name for path in out.iterdir()] == [".batch-elsewhere"]
+
+
+def test_a_list_that_is_a_pipe_is_not_waited_for(here: Path) -> None:
+    os.mkfifo(here / "list.txt")
+    with pytest.raises(SlamError, match="list.txt: not a regular file"):
+        storage.read_text(str(here / "list.txt"))
