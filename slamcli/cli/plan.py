@@ -172,9 +172,10 @@ def _walls(folder: RunDir) -> list[Wall]:
     from slamcli.formats import cloud
     from slamcli.navigation.walls import LEAST_HEIGHT, find_walls
 
-    path = folder.path / "densify" / "cloud.ply"
-    xyz, _, normal = cloud.read_ply(path) if path.exists() else (None, None, None)
-    return [] if xyz is None or normal is None else find_walls(xyz, normal, least_height=LEAST_HEIGHT)
+    if not (folder.path / "densify" / "cloud.ply").exists():
+        return []
+    xyz, _, normal = cloud.read_ply(folder.stage_path("densify", "cloud.ply"))
+    return [] if normal is None else find_walls(xyz, normal, least_height=LEAST_HEIGHT)
 
 
 def _tell_reachable(

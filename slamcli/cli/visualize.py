@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -112,13 +113,15 @@ def _findings(folder: RunDir) -> list[tuple[str, str]]:
 
     kept, digest = folder.path / "inspection.json", folder.info()["digest"]
     try:
-        known = files.read_json(kept) if kept.is_file() else {}
+        known = {}
+        with contextlib.suppress(SlamError, OSError):  # not there yet, or damaged
+            known = files.read_sealed(kept)
         if known.get("digest") != digest:
             roots = [entry["root"] for entry in folder.recordings] or [folder.info()["root"]]
             camera = dict(folder.config().camera) or None
             found = [inspection.inspect(root, camera=camera, progress=console.progress).to_dict() for root in roots]
             known = {"digest": digest, **found[0], "findings": [finding for one in found for finding in one["findings"]]}
-            files.write_text(kept, json.dumps(known, indent=1) + "\n")
+            files.write_sealed(kept, known)
         return [(one["level"], f"{one['message']}: {one['advice']}".removesuffix(": ")) for one in known["findings"]]
     except (SlamError, OSError, KeyError, TypeError, AttributeError) as error:
         console.say(f"the recording is not inspected: {error}")

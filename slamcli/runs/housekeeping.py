@@ -107,9 +107,11 @@ def archive(run: RunDir, out: Path, *, skip: Sequence[str] = ()) -> int:
     """Write a run's files to the zip file `out`, all or none; returns how many they are. The same run gives the same bytes.
 
     skip : stages that are left out; what is unpacked knows that they were, as after `clean`
+    Raises SlamError where a file is not what its stage recorded: what is kept for long is worth a look.
     """
     if out.resolve().is_relative_to(run.path.resolve()):
         raise SlamError(f"{out}: lies in the run that is to be packed; choose another place")
+    _check_intact(run, skip)
     chosen = [path for path in files_of(run) if path.relative_to(run.path).parts[0] not in skip]
     with files.whole(out) as file, zipfile.ZipFile(file, "w", compression=zipfile.ZIP_DEFLATED) as packed:
         for path in chosen:
@@ -121,3 +123,18 @@ def archive(run: RunDir, out: Path, *, skip: Sequence[str] = ()) -> int:
             with io.BytesIO(text.encode()) if is_about else path.open("rb") as source, packed.open(entry, "w", force_zip64=True) as target:
                 shutil.copyfileobj(source, target, 1 << 20)
     return len(chosen)
+
+
+def _check_intact(run: RunDir, skip: Sequence[str]) -> None:
+    run.config()
+    for stage in NAMES:
+        if stage not in skip and (found := run.damage(stage, verify=True)):
+            raise SlamError(f"{run.path}/{found}: it is damaged; repair it with: slamcli run {run.flag}")
+    for entry in run.recordings if RECORDINGS not in skip else ():
+        own = RunDir(run.recording_path(entry["name"]))
+        if own.path.is_dir():
+            try:
+                own.info()
+                _check_intact(own, skip)
+            except SlamError as error:
+                raise SlamError(f"{str(error).partition('; ')[0]}; repair it with: slamcli run {run.flag}") from error

@@ -160,12 +160,15 @@ def test_frames_of_other_map_segments_are_told_of(made: finished.Finished) -> No
 def test_findings_on_the_recording_are_on_the_page_and_looked_for_once(slamcli: Command, tmp_path: Path) -> None:
     made = finished.make(tmp_path, frames=30, n_lost=0)
     assert "have no reading" not in page_of(slamcli, made.run, tmp_path / "report.html").text
-    kept = json.loads((made.run / "inspection.json").read_text())
+    kept = files.read_sealed(made.run / "inspection.json")
     kept["findings"] = [{"level": "error", "check": "holes", "message": "no <depth> at all", "advice": "look at the lens"}]
-    (made.run / "inspection.json").write_text(json.dumps(kept))
+    files.write_sealed(made.run / "inspection.json", kept)
     assert "Recording: no <depth> at all: look at the lens" in page_of(slamcli, made.run, tmp_path / "report.html").text
-    (made.run / "inspection.json").write_text(json.dumps({**kept, "digest": "of another recording"}))
+    files.write_sealed(made.run / "inspection.json", {**kept, "digest": "of another recording"})
     assert "no <depth> at all" not in page_of(slamcli, made.run, tmp_path / "report.html").text
+    (made.run / "inspection.json").write_text(json.dumps(kept))  # another file than the one that was written: not believed
+    assert "no <depth> at all" not in page_of(slamcli, made.run, tmp_path / "report.html").text
+    assert files.read_sealed(made.run / "inspection.json")["findings"] != kept["findings"]
     assert slamcli("report", "-r", made.run, "--no-inspect").exit_code == 0
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import finished
 import pytest
 
+from slamcli.cli import plan
 from slamcli.errors import SlamError
 from slamcli.runs import housekeeping
 from slamcli.runs.run_directory import RunDir
@@ -98,3 +99,24 @@ def test_archive_says_what_is_wrong_and_leaves_nothing(made, slamcli, here, out:
     assert result.exit_code == 1
     assert says in result.stderr
     assert not [path for path in here.rglob("*") if "a.zip" in path.name]
+
+
+def test_a_damaged_run_is_not_packed(made, slamcli, here) -> None:
+    for name in ("loop/trajectory.txt", "loop/stage.json", "extract/xy.npy", "config.toml"):
+        before = (made / name).read_bytes()
+        (made / name).write_bytes(before[:-1] + bytes([before[-1] ^ 1]))
+        result = slamcli("archive", "a.zip", "-r", "mine")
+        assert result.exit_code == 1 and name.rpartition("/")[2] in result.stderr and "slamcli run" in result.stderr
+        assert not (here / "a.zip").exists()
+        assert (slamcli("archive", "r.zip", "--results", "-r", "mine").exit_code == 0) == (name == "extract/xy.npy")
+        (made / name).write_bytes(before)
+
+
+def test_a_plan_with_walls_refuses_a_damaged_cloud(made) -> None:
+    cloud = made / "densify" / "cloud.ply"
+    before = cloud.read_bytes()
+    cloud.write_bytes(before[:-1] + bytes([before[-1] ^ 1]))
+    with pytest.raises(SlamError, match="other content than recorded"):
+        plan._walls(RunDir.find("mine"))
+    cloud.unlink()
+    assert plan._walls(RunDir.find("mine")) == []
