@@ -1,5 +1,6 @@
 """`python -m slamcli`, and the command `slamcli`."""
 
+import io
 import os
 import sys
 
@@ -10,6 +11,7 @@ def main() -> None:
     """Run the command line in a process of its own, for which signals, standard streams and libraries are set up first."""
     interruption.catch()  # before anything heavy is imported
     _open_what_is_closed()
+    _say_any_name()
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # a run uses one, and each reserves memory that may not be there
     from slamcli.cli.main import cli
 
@@ -28,6 +30,13 @@ def _open_what_is_closed() -> None:
                 os.close(opened)
         if getattr(sys, name) is None:
             setattr(sys, name, open(number, mode, closefd=False))  # noqa: SIM115  # for the life of the process
+
+
+def _say_any_name() -> None:
+    """Let standard output take names that are not valid in its encoding; standard error does so by itself."""
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        is_utf8 = sys.stdout.encoding.lower().replace("-", "") == "utf8"
+        sys.stdout.reconfigure(errors="surrogateescape" if is_utf8 else "backslashreplace")
 
 
 if __name__ == "__main__":

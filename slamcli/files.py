@@ -80,7 +80,7 @@ def clear_leftover(path: str | Path) -> None:
 
 def write_text(path: str | Path, text: str) -> None:
     """Replace a text file at once: a reader, or a power cut, meets the old text or the new."""
-    write_bytes(path, text.encode())
+    write_bytes(path, text.encode(errors="surrogateescape"))  # a name in it that is not UTF-8 as it is
 
 
 def write_bytes(path: str | Path, data: bytes) -> None:

@@ -3,7 +3,7 @@
 import logging
 import os
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from typing import TYPE_CHECKING, Any
 
 from slamcli import files
@@ -35,18 +35,22 @@ def local_size(workers: int | None) -> tuple[int, int, int]:
 
 @contextmanager
 def local(workers: int, memory: int, *, progress: Progress = silent, tell: Tell = log.info) -> "Iterator[Client]":
-    """Start a cluster of worker processes on this machine; it ends with the block."""
+    """Start a cluster of worker processes on this machine; it ends with the block. SlamError when they do not start."""
     _quiet()
     from distributed import Client, LocalCluster
 
     compilation.ensure(progress=progress, tell=tell)  # once, and not by every worker at the same time
     options = {"n_workers": workers, "threads_per_worker": 1, "memory_limit": memory, "dashboard_address": None}
     options |= {"silence_logs": logging.CRITICAL}
-    with (
-        files.scratch("slamcli-batch-") as folder,
-        LocalCluster(processes=True, host="127.0.0.1", local_directory=str(folder), **options) as cluster,
-        Client(cluster) as client,
-    ):
+    with ExitStack() as stack:
+        folder = stack.enter_context(files.scratch("slamcli-batch-"))
+        try:
+            cluster = stack.enter_context(LocalCluster(processes=True, host="127.0.0.1", local_directory=str(folder), **options))
+            client = stack.enter_context(Client(cluster))
+        except (RuntimeError, TimeoutError) as error:  # what Dask says where a process does not come up in time
+            raise SlamError(
+                f"the workers do not start ({_first_line(error)}): the machine is too busy or short of memory; start fewer with --workers"
+            ) from error
         yield client
 
 

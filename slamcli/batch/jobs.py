@@ -79,9 +79,11 @@ def _listed(recordings: Iterable[str]) -> list[str]:
 
 def _absolute(recording: str) -> str:
     """Make a path independent of the current folder, which is another one where the workers are."""
+    if not recording.strip():
+        raise SlamError("an empty name among the recordings; name a folder, a list, tum/fr1_room or demo")
     if storage.is_url(recording):
         return recording.rstrip("/")
-    path = Path(recording).expanduser()
+    path = files.user_path(recording)
     return str(path.resolve()) if path.exists() else recording
 
 
@@ -98,7 +100,7 @@ def names(recordings: Sequence[str]) -> list[str]:
 
 def absolute_out(out: str) -> str:
     """Make the folder of the runs an absolute path; a URL stays one."""
-    return out.rstrip("/") if storage.is_url(out) else os.path.abspath(os.path.expanduser(out))
+    return out.rstrip("/") if storage.is_url(out) else os.path.abspath(files.user_path(out))
 
 
 def with_threads(order: Order, threads: int) -> Order:

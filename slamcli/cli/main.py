@@ -13,6 +13,7 @@ from slamcli.cli.common import verbose_option
 from slamcli.errors import SlamError
 
 LACKING = ("Cannot allocate", "failed to map", "start new thread", "load shared object")  # in the errors of libraries short of memory
+NAME_SHOWN = 40  # letters on either side of one that no name may hold
 TOPICS = (
     "run",
     "batch",
@@ -52,6 +53,9 @@ class Group(click.Group):
             if error.errno == errno.EPIPE or (error.errno is None and not _lacks_memory(error)):
                 raise
             raise click.ClickException(_told(error)) from error
+        except UnicodeEncodeError as error:  # of a name, wherever it was to be written or said
+            near = error.object[max(error.start - NAME_SHOWN, 0) : error.end + NAME_SHOWN]
+            raise click.ClickException(f"{near!r}: a name that is not valid {error.encoding}; rename the file or folder") from error
         except (MemoryError, ImportError, RuntimeError) as error:
             if not _lacks_memory(error):
                 raise

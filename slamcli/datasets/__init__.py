@@ -11,6 +11,7 @@ from slamcli.datasets.assembly import assemble
 from slamcli.datasets.protocol import Dataset
 from slamcli.datasets.readers import READERS, reader_of
 from slamcli.errors import SlamError
+from slamcli.files import user_path
 from slamcli.user_cache import user_cache
 
 __all__ = ["READERS", "Dataset", "open_dataset", "silent"]
@@ -67,7 +68,7 @@ def _locate(target: str, data: str | None, progress: Progress) -> tuple[Path, st
         return demo_folder(user_cache(), progress=progress), DEMO
     if not target.strip():
         raise SlamError("no recording named; give a folder, tum/fr1_room or demo")
-    path = Path(target).expanduser()
+    path = user_path(target)
     if path.exists():
         return path, _name_of(path)
     roots = _data_roots(data)
@@ -86,10 +87,10 @@ def _locate(target: str, data: str | None, progress: Progress) -> tuple[Path, st
 
 
 def _data_roots(data: str | None) -> list[Path]:
-    if data is not None and not Path(data).expanduser().is_dir():
+    if data is not None and not user_path(data).is_dir():
         raise SlamError(f"--data {data}: no such folder")
     given = [data, os.environ.get("SLAMCLI_DATA"), "data"]
-    return [Path(root).expanduser() for root in given if root] + [user_cache() / "datasets"]
+    return [user_path(root) for root in given if root] + [user_cache() / "datasets"]
 
 
 def _variants(target: str) -> list[str]:

@@ -269,7 +269,8 @@ def _or_plainer(colours: Colours, edges: list[Edges], shift: tuple[int, int], la
     Many pairs fit nearly as well while the picture moves evenly, and the search may end at any of them. The flag says whether they are
     those of a sound recording.
     """
-    near, registered = range(-PLAIN_SHIFT, PLAIN_SHIFT + 1), {}
+    near = range(-PLAIN_SHIFT, PLAIN_SHIFT + 1)
+    registered: dict[tuple[tuple[int, int], float], float] = {}
     for t in LAGS[::2]:
         places = _at_lag(colours, edges, float(t))
         registered |= {((dx, dy), float(t)): _score(colours, places, dx, dy) for dx in near for dy in near}
