@@ -81,7 +81,6 @@ def test_a_name_that_is_no_text_is_told_or_taken(slamcli: Slamcli, room_run: Pat
     shutil.copytree(room_run, run)
     for words in (["export-cloud", "c.ply"], ["report", "--no-inspect", "-o", "r.html"], ["export-trajectory", "t.txt"]):
         assert slamcli(*words, "-r", run).exit_code == 0, words
-    assert b"n\xff" in (here / "r.html").read_bytes()
     result = slamcli("archive", "a.zip", "-r", run.resolve().rename(here / os.fsdecode(b"m\xff")))
     assert result.exit_code == 1 and "not valid utf-8; rename" in result.stderr
     assert not (here / "a.zip").exists()
