@@ -340,6 +340,8 @@ class RunDir:
                 old.rename(self.path / stage)
             for leftover in self.path.glob(f".{stage}.*"):
                 shutil.rmtree(leftover)
+        for leftover in (self.path / RECORDINGS).glob(".*.part"):
+            shutil.rmtree(leftover)
         for name in ("run.json", "config.toml"):
             files.clear_leftover(self.path / name)
 

@@ -227,13 +227,13 @@ def test_readers_need_no_lock_and_no_permission_to_write(run: RunDir) -> None:
 
 
 def test_leftovers_of_the_dead_are_cleared_once_the_lock_is_held(run: RunDir) -> None:
-    for leftover in (".track.4711", ".track.old"):
-        (run.path / leftover).mkdir()
+    for leftover in (".track.4711", ".track.old", "recordings/.monday.part"):
+        (run.path / leftover).mkdir(parents=True)
         (run.path / leftover / "half").write_text("x")
     before = fakes.digests(run)
     with run.lock():
         pass
-    assert not list(run.path.glob(".track.*"))
+    assert not list(run.path.glob(".track.*")) and not list((run.path / "recordings").iterdir())
     assert fakes.digests(run) == before
 
 
