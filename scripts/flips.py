@@ -37,7 +37,8 @@ def main() -> int:
     options.add_argument("--seed", type=int, default=0)
     given = options.parse_args()
     with tempfile.TemporaryDirectory(prefix="slamcli-flips-") as folder:
-        stand = Stand(Path(folder), given.one, given.two)
+        makers = {"run": (), "house": COMMANDS[2:3], "grown": COMMANDS[3:4]}[given.run]  # readers are given once the run is whole
+        stand = Stand(Path(folder), given.one, given.two, makers)
         return Flips(stand, given.run).all(random.Random(given.seed), given.only)
 
 

@@ -59,7 +59,7 @@ COMMANDS: tuple[Command, ...] = (
     ),
     ("report", "-r", "run", "-o", "out/report.html", "--no-inspect"),
     ("eval", "ape", "-r", "run", "--plot", "out/ape.png"),
-    ("compare", "run", "house", "-o", "out/compare.html"),
+    ("compare", "run", "grown", "-o", "out/compare.html"),
     ("archive", "out/run.zip", "-r", "run"),
     ("localize", "run", "TWO", "--out", "out/localized.txt"),
     ("vocab", "export", "out/words.txt", "words.npz"),
