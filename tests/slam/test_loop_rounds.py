@@ -180,3 +180,9 @@ def test_each_side_of_a_closure_is_looked_for_on_the_other(monkeypatch, most: in
     of_50 = set().union(*(ids[pair] for pair in ids if 50 in pair))
     assert {kf for kf, _ in rounds.fused} == here | {2}
     assert all(seen == ids[2, 3] for kf, seen in rounds.fused if kf != 2) and dict(rounds.fused)[2] == of_50
+
+
+def test_what_was_refused_is_tried_again_on_the_corrected_map(monkeypatch):
+    rounds = Rounds(monkeypatch, alike=[(50, 2), (30, 20)], refused=((50, 2),), rounds=2)
+    rounds.closer.close_loops()
+    assert rounds.tried == [(50, 2), (30, 20), (50, 2)]
