@@ -44,6 +44,11 @@ TESTS = {  # that are about a module
     "slam/map_merging": ["slam/test_map_segments.py", "options/test_loop_options.py"],
     "navigation/grid": ["navigation/test_grid_fusion.py", "navigation/test_grid.py", "navigation/test_grid_hazards.py"],
     "navigation/planner": ["navigation/test_planner.py"],
+    "slam/background_prior": ["slam/test_background_prior.py"],
+    "slam/moving_objects": ["slam/test_moving_objects.py"],
+    "slam/pose_doubt": ["slam/test_pose_doubt.py"],
+    "slam/doubt": ["slam/test_doubt.py", "slam/test_pose_doubt.py"],
+    "evaluation/map_verdict": ["evaluation/test_verdict_limits.py", "evaluation/test_map_verdict.py"],
 }
 SLOWER = 6.0  # times as long as unchanged code, beyond COMPILING, may a mutant take; then it counts as noticed
 COMPILING = 60.0  # [s]

@@ -32,6 +32,27 @@ def test_only_grave_findings_put_the_whole_in_doubt() -> None:
     assert GRAVE.text in said and MILD.text not in said and "\n" not in said
 
 
+def collected(*names: str) -> list[str]:
+    """Collect findings, of which those in capitals are grave, and give back their names."""
+    findings = [Finding(name.lower(), name, is_grave=name.isupper()) for name in names]
+    return [finding.text for finding in doubt.from_records({"track": {"summary": doubt.to_summary(findings)}})]
+
+
+def test_a_grave_cause_leaves_out_what_follows_from_it_and_nothing_else() -> None:
+    assert collected("lens", "REGISTRATION", "poses") == ["REGISTRATION", "poses"]
+    assert collected("REGISTRATION", "FROZEN", "focal_length", "POSES") == ["FROZEN", "POSES"]
+    assert collected("FROZEN", "frozen_depth", "DEPTH_READINGS") == ["FROZEN", "DEPTH_READINGS", "frozen_depth"]
+    assert collected("registration", "LENS") == ["LENS", "registration"], "a mild one explains nothing"
+    assert collected("LENS", "focal_length") == ["LENS", "focal_length"]
+
+
+def test_findings_are_added_to_those_that_are_there() -> None:
+    summary = {"frames": 3} | doubt.to_summary([MILD])
+    assert doubt.joined(summary, []) == summary
+    assert doubt.joined(summary, [GRAVE]) == {"frames": 3} | doubt.to_summary([MILD, GRAVE])
+    assert doubt.joined({"frames": 3}, [GRAVE]) == {"frames": 3} | doubt.to_summary([GRAVE])
+
+
 @pytest.mark.parametrize(
     ("frames", "stretches"), [([], []), ([0, 0], []), ([1, 1, 0, 1], [(0, 1), (3, 3)]), ([0, 1, 1, 1], [(1, 3)]), ([1], [(0, 0)])]
 )  # fmt: skip

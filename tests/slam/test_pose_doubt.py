@@ -104,3 +104,26 @@ def test_few_landmarks_drift_only_where_things_move() -> None:
     assert (
         drift.max() == pytest.approx(np.sqrt(15) * pose_doubt.STEP_WORST, rel=0.1) and (judged(room()[1], n_inliers=weak).drift == 0).all()
     )
+
+
+@pytest.mark.parametrize(("n_doubtful", "n_lost", "is_grave"), [(7, 0, False), (8, 0, True), (7, 5, True), (7, 4, False)])
+def test_a_fifth_of_the_poses_in_doubt_puts_the_run_in_doubt_and_the_lost_have_none(n_doubtful: int, n_lost: int, is_grave: bool) -> None:
+    record = judged(room()[1])
+    sigma, is_doubtful = record.sigma.copy(), np.arange(FRAMES) < n_doubtful
+    sigma[FRAMES - n_lost :], is_doubtful[FRAMES - n_lost :] = np.nan, True
+    (finding,) = pose_doubt.findings(replace(record, sigma=sigma, is_doubtful=is_doubtful))
+    assert finding.is_grave == is_grave and f"{n_doubtful} of {FRAMES - n_lost} frames" in finding.text
+
+
+@pytest.mark.parametrize(("contradicted", "is_told"), [(0.029, False), (0.031, True)])
+def test_surface_that_is_looked_through_is_told_of_where_it_is_more_than_right_poses_leave(contradicted: float, is_told: bool) -> None:
+    record = replace(judged(room()[1]), contradicted=np.full(FRAMES, contradicted, np.float32), is_doubtful=np.arange(FRAMES) < 9)
+    assert ("look through 3%" in pose_doubt.findings(record)[0].text) == is_told
+
+
+@pytest.mark.parametrize(("n", "is_tied"), [(29, False), (30, True)])
+def test_thirty_landmarks_seen_first_and_last_tie_two_key_frames(n: int, is_tied: bool) -> None:
+    _, map_ = found(room()[1], ties=((3, 9), (20, 20)))
+    rows = np.flatnonzero((map_.obs_lm < n) | (map_.obs_lm >= 50))
+    map_ = replace(map_, obs_lm=np.unique(map_.obs_lm[rows], return_inverse=True)[1], obs_kf=map_.obs_kf[rows])
+    assert pose_doubt._ties(map_).tolist() == ([[3, 9]] if is_tied else [])
