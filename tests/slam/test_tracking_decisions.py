@@ -108,6 +108,7 @@ def test_a_dark_frame_could_not_be_recognized_and_does_not_count():
     tracker = track(scene, segment_after=4)
     segment = frame_segments(tracker.tracks(), tracker.map())
     assert segment.tolist() == [0] * 8 + [1] * 2 + [-1] * 5 + [1] * 2, "and the segment begins with the first that was lost"
+    assert tracker.tracks().state[8] == KEY_FRAME and len(np.unique(tracker.map().kf_frame)) == len(tracker.map().kf_frame)
     assert set(tracker.lost_reason) == set(np.flatnonzero(where == "dark").tolist())
     assert all(reason == "0 features: blank or unreadable image" for reason in tracker.lost_reason.values())
 
@@ -170,5 +171,18 @@ def test_where_no_landmark_holds_a_frame_the_background_carries_it_on():
         assert (
             np.abs(se3.log(se3.inverse(se3.inverse(T_wc[i - 1]) @ T_wc[i]) @ se3.inverse(background[i - 1]) @ background[i])).max() < 1e-9
         )
-    assert tracker._poses.anchored >= 9 and track(scene, motion=KnownMotion(background=background), until=9)._poses.anchored == 5
+    carried = track(scene, motion=KnownMotion(background=background), until=9)
+    assert tracker._poses.anchored >= 9 and carried._poses.anchored == 5
+    assert carried._add_previous_as_key_frame(9) is None, "what was not measured is no key frame"
     assert not tracker.lost_reason
+
+
+def test_the_frame_before_becomes_a_key_frame_once_and_only_where_its_pose_was_measured():
+    tracker = track(seen(sweep(8, length=0.1), blind=(6,)), until=6, key_frame_share=0.0)
+    assert tracker.tracks().state[5] == TRACKED
+    made = tracker._add_previous_as_key_frame(6)
+    assert made == 1 and tracker.map().kf_frame.tolist() == [0, 5] and tracker.tracks().state[5] == KEY_FRAME
+    assert tracker._add_previous_as_key_frame(6) is None, "it is one already"
+    tracker.process(6)
+    assert tracker._add_previous_as_key_frame(7) is None, "that one is lost"
+    assert tracker.map().kf_frame.tolist() == [0, 5]
