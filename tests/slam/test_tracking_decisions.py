@@ -123,6 +123,7 @@ def test_after_a_frame_of_which_no_landmark_is_known_those_of_its_reference_are_
     scene = seen(sweep(8, length=0.1))
     tracker = track(scene, until=6)
     tracker._previous.remember(tracker._previous.features, nothing_seen(tracker._previous.features))
+    tracker._sparse_map.add_key_frame(7, np.eye(4), segment=1)  # the last key frame is another, and sees nothing
     tracker.process(6)
     tracks = tracker.tracks()
     assert tracks.state[6] == TRACKED and tracks.n_inliers[6] > 0.7 * tracks.n_inliers[5]
