@@ -1,13 +1,16 @@
 """What tracking decides from frame to frame: where a map begins, what a key frame is, what a lost frame leads to, what predicts."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from scenes import Scene, observe, orbit, room_points, sweep
 
 from slamcli.config.options import SensorConfig, TrackConfig
 from slamcli.geometry import se3
-from slamcli.schema import KEY_FRAME, LOST, RELOCALIZED, TRACKED, frame_poses, frame_segments
+from slamcli.schema import KEY_FRAME, LOST, ON_DEPTH, RELOCALIZED, TRACKED, frame_poses, frame_segments
 from slamcli.slam import background_prior
+from slamcli.slam.depth_localization import DepthMatch
 from slamcli.slam.localizer import nothing_seen
 from slamcli.slam.recording import NOTHING_KNOWN, KnownMotion
 from slamcli.slam.tracker import Tracker
@@ -120,13 +123,14 @@ def test_what_agrees_with_too_little_of_the_map_is_told_so():
 
 
 def test_after_a_frame_of_which_no_landmark_is_known_those_of_its_reference_are_looked_for():
-    scene = seen(sweep(8, length=0.1))
-    tracker = track(scene, until=6)
+    T_gc = sweep(8, length=0.1)
+    T_gc[6:] = T_gc[6:] @ se3.exp(np.array([0, 0, 0, 0, 0.1, 0]))  # 50 px: only what was matched, and lifted by depth, tells where they are
+    tracker = track(seen(T_gc), until=6, relocalize_inliers=NO_CROWD)
     tracker._previous.remember(tracker._previous.features, nothing_seen(tracker._previous.features))
     tracker._sparse_map.add_key_frame(7, np.eye(4), segment=1)  # the last key frame is another, and sees nothing
     tracker.process(6)
     tracks = tracker.tracks()
-    assert tracks.state[6] == TRACKED and tracks.n_inliers[6] > 0.7 * tracks.n_inliers[5]
+    assert tracks.state[6] != LOST and tracks.n_inliers[6] > 0.5 * tracks.n_inliers[5]
 
 
 def drifting(T_gc: np.ndarray) -> np.ndarray:
@@ -187,3 +191,21 @@ def test_the_frame_before_becomes_a_key_frame_once_and_only_where_its_pose_was_m
     tracker.process(6)
     assert tracker._add_previous_as_key_frame(7) is None, "that one is lost"
     assert tracker.map().kf_frame.tolist() == [0, 5]
+
+
+def test_a_pose_is_weighed_against_the_motion_since_the_frame_before_alone():
+    scene = seen(sweep(10, length=0.1))
+    background = drifting(scene.T_gc)
+    background[3:] = se3.exp(np.array([1.0, 0, 0, 0, 0, 0])) @ background[3:]  # it errs once
+    state = track(scene, motion=KnownMotion(background=background), key_frame_share=0.0, key_frame_gap=100).tracks().state
+    assert state[3] == RELOCALIZED and (np.delete(state, [0, 3]) == TRACKED).all()
+
+
+def test_a_frame_that_depth_places_counts_the_landmarks_that_agree():
+    tracker = track(seen(sweep(6, length=0.1)), until=5)
+    landmark = np.array([4, -1, 7, -1, -1, 9, 2], np.int32)
+    placement = SimpleNamespace(kf=0, T_cw=np.eye(4))
+    location = tracker._localizer._record_by_depth(5, DepthMatch(placement, landmark, is_anchored=False))
+    tracks = tracker.tracks()
+    assert (tracks.state[5], tracks.n_inliers[5], tracks.ref_kf[5]) == (ON_DEPTH, 4, 0) and tracker._poses.anchored == 4
+    assert location.landmark is landmark and location.placement is placement
