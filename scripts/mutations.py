@@ -6,8 +6,8 @@
 
 Modules are those of TESTS below. A copy of the checkout is mutated, never the checkout itself. Of a module's mutants, made by
 cosmic-ray's operators, some are drawn, at as many places of it as can be. Each runs the module's tests, the quickest first, up to the
-first that fails, in a process forked from one that has imported all that does not depend on the module: half a second where a test
-soon notices. Survivors are printed as diffs. Their tests need a Unix system.
+first that fails, in a process forked (Unix only) from one that has imported all that does not depend on the module: half a second where a
+test soon notices. Survivors are printed as diffs.
 """
 
 import argparse
@@ -236,8 +236,8 @@ def in_fork(task: Callable[[], None], *, log: Path | None, timeout: float = 1e6)
     child = os.fork()
     if child == 0:
         try:
-            os.setsid() if log is not None else None
             if log is not None:
+                os.setsid()
                 output = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
                 os.dup2(output, 1), os.dup2(output, 2)
             task()

@@ -28,12 +28,14 @@ class Join:
 def find_join(sparse_map: SparseMap, closures: list[Candidate], *, least: int) -> Join | None:
     """Find the two segments for which the most speaks; None where fewer than `least` closures agree on how two segments lie.
 
+    closures : verified, each between two segments
+
     One closure between segments stands alone: no odometry runs between them that could contradict it. So several have to say the same,
     and no others that say otherwise may come near them in weight, as they do where places look alike.
     """
     segment = sparse_map.kf.segment
     pairs = sorted({tuple(sorted((int(segment[c.kf_i]), int(segment[c.kf_j])))) for c in closures})
-    found = [_between(sparse_map, closures, a, b) for a, b in pairs if a != b]
+    found = [_between(sparse_map, closures, a, b) for a, b in pairs]
     return max((j for j in found if j is not None and len(j.closures) >= least), key=lambda j: j.support, default=None)
 
 
