@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
+from slamcli.datasets.sqlite import Connections
 from slamcli.errors import BadFrame, SlamError
 
 HEAD = 64  # bytes of a message that hold its stamp
@@ -228,31 +229,27 @@ class SqliteFile:
     def __init__(self, storage: Any) -> None:
         self.path = Path(storage.path)
         self._kinds = {c.id: (c.topic, c.msgtype) for c in storage.connections}
-        self._local = threading.local()
+        self._connections = Connections(self.path)
 
     def topics(self) -> list[tuple[str, str, list[tuple[int, int]]]]:
         """List the messages of each topic."""
         found = []
         for key, (topic, kind) in self._kinds.items():
-            rows = self._connection().execute("SELECT timestamp, id FROM messages WHERE topic_id = ? ORDER BY timestamp", (key,))
+            rows = self._connections.of_this_thread().execute(
+                "SELECT timestamp, id FROM messages WHERE topic_id = ? ORDER BY timestamp", (key,)
+            )
             found.append((topic, kind, [(int(time), int(row)) for time, row in rows]))
         return found
 
     def read(self, row: int, n: int | None = None) -> bytes:
         """Read a message or its beginning."""
         try:
-            with self._connection().blobopen("messages", "data", row, readonly=True) as blob:
+            with self._connections.of_this_thread().blobopen("messages", "data", row, readonly=True) as blob:
                 if len(blob) > MAX_MESSAGE:
                     raise BadFrame(f"{self.path}: a message of {len(blob) >> 20} MB is too large")
                 return blob.read(-1 if n is None else n)
         except sqlite3.Error as error:
             raise BadFrame(f"{self.path}: message {row} is damaged ({error})") from error
-
-    def _connection(self) -> sqlite3.Connection:
-        if not hasattr(self._local, "connection"):
-            uri = f"{self.path.resolve().as_uri()}?mode=ro&immutable=1"
-            self._local.connection = sqlite3.connect(uri, uri=True, check_same_thread=False)
-        return self._local.connection
 
 
 class McapFile:

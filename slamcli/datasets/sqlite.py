@@ -2,7 +2,9 @@
 
 import sqlite3
 import threading
+import weakref
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -18,10 +20,31 @@ MAX_BLOB = 256 << 20  # bytes of one image
 def query(path: Path, text: str, *, what: str) -> list[tuple[Any, ...]]:
     """Run a query on a file opened for reading; SlamError where the file is not what it should be."""
     try:
-        with _connect(path) as connection:
+        with closing(_connect(path)) as connection:
             return connection.execute(text).fetchall()
     except (sqlite3.Error, UnicodeDecodeError) as error:
         raise SlamError(f"{path}: is not {what}, or is damaged ({error})") from error
+
+
+class Connections:
+    """A connection to a file for each thread that asks; it is closed when the thread ends or this object goes."""
+
+    def __init__(self, path: Path) -> None:
+        self._path, self._local = path, threading.local()
+
+    def of_this_thread(self) -> sqlite3.Connection:
+        """Return the connection that belongs to the calling thread."""
+        if not hasattr(self._local, "held"):
+            self._local.held = _Held(_connect(self._path))
+        return self._local.held.connection
+
+
+class _Held:
+    """A connection that is closed with its last owner: Python 3.13 warns of one that is only forgotten."""
+
+    def __init__(self, connection: sqlite3.Connection) -> None:
+        self.connection = connection
+        weakref.finalize(self, connection.close)
 
 
 class Blobs:
@@ -37,7 +60,7 @@ class Blobs:
         decode: Callable[[bytes, str], bytes | np.ndarray] | None = None,
     ) -> None:
         self.path, self._text, self._keys, self._sizes, self._label, self._decode = path, text, keys, sizes, label, decode
-        self._local = threading.local()  # a connection belongs to one thread
+        self._connections = Connections(path)
 
     @cached_property
     def names(self) -> list[str]:
@@ -57,9 +80,7 @@ class Blobs:
         if self._sizes[i] > MAX_BLOB:
             raise BadFrame(f"{self.where(i)}: {self._sizes[i] >> 20} MB is too large for an image")
         try:
-            if not hasattr(self._local, "connection"):
-                self._local.connection = _connect(self.path)
-            row = self._local.connection.execute(self._text, (self._keys[i],)).fetchone()
+            row = self._connections.of_this_thread().execute(self._text, (self._keys[i],)).fetchone()
         except sqlite3.Error as error:
             raise BadFrame(f"{self.where(i)}: cannot be read ({error})") from error
         data = bytes(row[0]) if row and row[0] is not None else b""
