@@ -22,8 +22,7 @@ def file(tmp_path: Path) -> Path:
 def is_open(connection: sqlite3.Connection) -> bool:
     try:
         connection.execute("SELECT x FROM t")
-    except sqlite3.ProgrammingError as error:
-        assert "closed" in str(error)
+    except sqlite3.ProgrammingError:
         return False
     return True
 
