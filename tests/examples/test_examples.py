@@ -65,7 +65,7 @@ def test_plan_path_stays_in_the_room(play, here: Path) -> None:
 
 
 def test_plan_path_says_so_when_there_is_no_floor_to_drive_on(play, room: Path) -> None:
-    with pytest.raises(SystemExit, match="no free place"):
+    with pytest.raises(SystemExit, match="fits nowhere in this grid: try a smaller radius"):
         play("plan_path.py", room)
 
 

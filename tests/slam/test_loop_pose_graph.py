@@ -60,14 +60,14 @@ def test_an_edge_holds_what_the_map_says_and_is_as_certain_as_its_landmarks_are_
     share(sparse_map, (0, 1), 200)
     closure = Candidate(2, 0, 0.5, 100, n_inliers, T_ij=se3.exp(np.array([0.1, 0, 0, 0, 0, 0.2])))
     graph = loop_pose_graph.build(sparse_map, [closure], SETTINGS)
-    assert graph.edge_kf.tolist() == [[1, 0], [2, 1], [2, 0]] and graph.is_closure.tolist() == [False, False, True]
+    assert graph.edges.kf.tolist() == [[1, 0], [2, 1], [2, 0]] and graph.is_closure.tolist() == [False, False, True]
     x_w = np.array([0.2, -0.5, 3.0])
-    for (i, j), T_ij in zip(graph.edge_kf[:2], graph.edge_T_ij[:2], strict=True):
+    for (i, j), T_ij in zip(graph.edges.kf[:2], graph.edges.T_ij[:2], strict=True):
         x_i, x_j = (se3.transform(se3.inverse(T_wk[kf]), x_w) for kf in (i, j))
         np.testing.assert_allclose(se3.transform(T_ij, x_j), x_i, atol=1e-12)
-    np.testing.assert_array_equal(graph.edge_T_ij[2], closure.T_ij)
+    np.testing.assert_array_equal(graph.edges.T_ij[2], closure.T_ij)
     of_hundred = np.diag([2500.0] * 3 + [10_000.0] * 3)  # 2 cm and 0.01 rad
-    np.testing.assert_allclose(graph.information, of_hundred * np.array([2.0, 0.01, times])[:, None, None])
+    np.testing.assert_allclose(graph.edges.information, of_hundred * np.array([2.0, 0.01, times])[:, None, None])
 
 
 def test_the_first_key_frame_of_each_segment_stays_where_it_is():
