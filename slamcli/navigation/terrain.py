@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import f4, f8, i4
-from scipy import ndimage
 
 from slamcli.config.options import GridConfig
 from slamcli.errors import SlamError
@@ -121,6 +120,8 @@ def find_terrain(levels: Levels, *, settings: GridConfig, max_cells: int) -> Ter
     is_level = np.isfinite(height)
     _grow(first, bins.astype(np.int32), levels.n, mean, settings.band_low, height)
     slopes = ~is_level & np.isfinite(height)
+    if np.count_nonzero(slopes & (np.abs(height) > settings.band_low)) < LEAST_CELLS:  # in most rooms: what follows only leaves out more
+        return None
     steep = _steep(height, slopes, settings)
     kept = _joined(np.isfinite(height) & ~steep, is_level) & ~is_level
     if np.count_nonzero(kept & (np.abs(height) > settings.band_low)) < LEAST_CELLS:  # the robot's height band begins above the rest
@@ -158,6 +159,8 @@ def _median(values: np.ndarray) -> np.ndarray:
 
 def _joined(cells: np.ndarray, to: np.ndarray) -> np.ndarray:
     """Keep the parts of `cells` (H, W), corners joined, that hold one of `to`."""
+    from scipy import ndimage  # takes as long to load as all of grid2d, which seldom needs it
+
     label, n = ndimage.label(cells, structure=np.ones((3, 3), dtype=int))
     holds = np.zeros(n + 1, dtype=bool)
     holds[label[to & cells]] = True
@@ -167,6 +170,8 @@ def _joined(cells: np.ndarray, to: np.ndarray) -> np.ndarray:
 
 def _filled(height: np.ndarray, known: np.ndarray, has_surface: np.ndarray) -> np.ndarray:
     """Give cells (H, W) of no surface the height of the nearest sloping floor, if it is near: what stands on a ramp, and gaps in it."""
+    from scipy import ndimage
+
     distance, (i, j) = ndimage.distance_transform_edt(~known, return_indices=True)
     return np.where(~has_surface & (distance <= FILLED), height[i, j], height)
 
