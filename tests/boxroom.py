@@ -67,3 +67,11 @@ def round_trip(*, height=0.6, pitch=0.25, step=0.15, margin=0.9, turn=0.2):
         for dyaw in np.arange(0.0, np.pi / 2, turn):
             poses.append(look_along([*b, height], yaw + dyaw, pitch))
     return np.stack(poses)
+
+
+def cells(made, x0, y0, x1, y1):
+    """Return the states of a grid's cells whose centres lie in a rectangle [m]."""
+    rows, columns = made.state.shape
+    y = made.origin[1] + (np.arange(rows) + 0.5) * float(made.resolution)
+    x = made.origin[0] + (np.arange(columns) + 0.5) * float(made.resolution)
+    return made.state[np.ix_((y > y0) & (y < y1), (x > x0) & (x < x1))]

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from boxroom import HANGING, KINECT, ROOM, kinect_noise, look_along, render, round_trip
+from boxroom import HANGING, KINECT, ROOM, cells, kinect_noise, look_along, render, round_trip
 
 from slamcli.config.options import GridConfig, SensorConfig
 from slamcli.geometry import se3
@@ -21,14 +21,6 @@ def build(T_lc, *, boxes=(), room=ROOM, change=None, settings=SETTINGS, near=0.5
     images = (z if change is None else change(z, T) for z, T in zip(exact, T_lc, strict=True))
     frames = [(kinect_noise(z, rng, near=near, far=far), T) for z, T in zip(images, T_lc, strict=True)]
     return build_grid(frames, KINECT, settings=settings, sensor=SensorConfig())
-
-
-def cells(made, x0, y0, x1, y1):
-    """The states of the cells whose centres lie in a rectangle."""
-    rows, columns = made.state.shape
-    y = made.origin[1] + (np.arange(rows) + 0.5) * float(made.resolution)
-    x = made.origin[0] + (np.arange(columns) + 0.5) * float(made.resolution)
-    return made.state[np.ix_((y > y0) & (y < y1), (x > x0) & (x < x1))]
 
 
 def drive(x0, x1, *, y=2.5, height=0.6, pitch=0.35, step=0.1, yaw=0.0):

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from boxroom import KINECT, kinect_noise, look_along, render
+from boxroom import KINECT, cells, kinect_noise, look_along, render
 
 from slamcli.config.options import GridConfig, SensorConfig
 from slamcli.errors import SlamError
@@ -48,14 +48,6 @@ def hall(*, rise, settings=SETTINGS, y=(0.0, 3.0), boxes=(), ahead=(1.0, 6.5)):
         exact = with_ramp(render(T, boxes=(lower, *boxes), room=HALL), T, rise=rise, y=y)
         frames.append((kinect_noise(exact, rng), T))
     return build_grid(frames, KINECT, settings=settings, sensor=SensorConfig())
-
-
-def cells(made, x0, y0, x1, y1):
-    """The states of the cells whose centres lie in a rectangle."""
-    rows, columns = made.state.shape
-    y = made.origin[1] + (np.arange(rows) + 0.5) * float(made.resolution)
-    x = made.origin[0] + (np.arange(columns) + 0.5) * float(made.resolution)
-    return made.state[np.ix_((y > y0) & (y < y1), (x > x0) & (x < x1))]
 
 
 def rise_of(degrees):
