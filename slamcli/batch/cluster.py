@@ -37,6 +37,7 @@ def local_size(workers: int | None) -> tuple[int, int, int]:
 def local(workers: int, memory: int, *, progress: Progress = silent, tell: Tell = log.info) -> "Iterator[Client]":
     """Start a cluster of worker processes on this machine; it ends with the block. SlamError when they do not start."""
     _quiet()
+    import dask
     from distributed import Client, LocalCluster
 
     compilation.ensure(progress=progress, tell=tell)  # once, and not by every worker at the same time
@@ -44,6 +45,7 @@ def local(workers: int, memory: int, *, progress: Progress = silent, tell: Tell 
     options |= {"silence_logs": logging.CRITICAL}
     with ExitStack() as stack:
         folder = stack.enter_context(files.scratch("slamcli-batch-"))
+        stack.enter_context(dask.config.set(temporary_directory=str(folder)))  # of the scheduler, which takes no folder else
         try:
             cluster = stack.enter_context(LocalCluster(processes=True, host="127.0.0.1", local_directory=str(folder), **options))
             client = stack.enter_context(Client(cluster))

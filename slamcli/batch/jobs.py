@@ -122,11 +122,11 @@ def prepared(order: Order) -> Iterator[Order]:
     out.mkdir(parents=True, exist_ok=True)
     _clear_markers(out)
     path = out / f"{MARKER}{uuid.uuid4().hex[:12]}"
-    with path.open("xb") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
-        file.write(os.fsencode(platform.node()))
-        file.flush()
+    with path.open("xb", buffering=0) as file:
         try:
+            fcntl.flock(file, fcntl.LOCK_EX)
+            with files.written(path):
+                file.write(os.fsencode(platform.node()))
             yield replace(order, marker=path.name)
         finally:
             path.unlink(missing_ok=True)

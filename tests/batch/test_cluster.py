@@ -6,6 +6,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -379,3 +380,11 @@ def test_without_dask_a_hint(here: Path, slamcli: Slamcli, monkeypatch: pytest.M
     with pytest.raises(SlamError, match=r"pip install 'slamcli\[cluster\]'"):
         cluster._quiet()
     assert "batch" in cli.commands
+
+
+def test_a_cluster_of_this_machine_leaves_nothing_in_the_temporary_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    with cluster.local(1, 1 << 30) as client:
+        assert len(client.nthreads()) == 1
+        assert any(tmp_path.iterdir())
+    assert list(tmp_path.iterdir()) == []

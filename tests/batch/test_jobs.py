@@ -1,6 +1,7 @@
 """What a batch is to do, and its table."""
 
 import csv
+import errno
 import io
 import os
 import platform
@@ -59,6 +60,19 @@ def test_stages_end_where_the_order_says() -> None:
 def test_the_marker_is_there_for_the_time_of_the_batch(here: Path) -> None:
     with jobs.prepared(Order(out=str(here / "runs"))) as order:
         assert (here / "runs" / order.marker).is_file()
+    assert list((here / "runs").iterdir()) == []
+
+
+def test_no_marker_is_left_of_a_batch_for_which_the_disk_had_no_room(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def no_room() -> str:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(jobs.platform, "node", no_room)
+    with (
+        pytest.raises(SlamError, match=r"runs/\.batch-\w+: cannot be written \(No space left"),
+        jobs.prepared(Order(out=str(here / "runs"))),
+    ):
+        pass
     assert list((here / "runs").iterdir()) == []
 
 
