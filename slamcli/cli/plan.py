@@ -103,7 +103,7 @@ def plan(
     radius = Config().robot.radius if radius is None else radius
     if reachable:
         start = _ends(grid, {"start": start}, trajectory, radius=radius, allow_unknown=allow_unknown)["start"]
-        walls = _walls(folder) if page is None else []
+        walls = _walls(folder, grid) if page is None else []
         _tell_reachable(grid, start, radius, allow_unknown, walls, png, as_json)
         return
     if goal is None:
@@ -167,15 +167,16 @@ def _fly(
     click.echo(f"{route.length:.2f} m, never nearer than {float(route.clearance.min()) + radius:.2f} m to what is not free", err=True)
 
 
-def _walls(folder: RunDir) -> list[Wall]:
-    """Find the walls in the run's cloud, if it is still there."""
+def _walls(folder: RunDir, grid: Grid) -> list[Wall]:
+    """Find the walls in the run's cloud, if it is still there: those of its floor plan, so that rooms have the same numbers."""
     from slamcli.formats import cloud
-    from slamcli.navigation.walls import LEAST_HEIGHT, find_walls
+    from slamcli.navigation.floor_plan import walls_of
+    from slamcli.navigation.walls import LEAST_HEIGHT
 
     if not (folder.path / "densify" / "cloud.ply").exists():
         return []
     xyz, _, normal = cloud.read_ply(folder.stage_path("densify", "cloud.ply"))
-    return [] if normal is None else find_walls(xyz, normal, least_height=LEAST_HEIGHT)
+    return [] if normal is None else walls_of(grid, xyz, normal, wall_height=LEAST_HEIGHT)
 
 
 def _tell_reachable(

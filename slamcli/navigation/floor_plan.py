@@ -44,8 +44,13 @@ def make_floor_plan(
     xyz, normal : (N, 3) of the cloud [m], level frame; wall_height : m that walls reach up to at least
     door_width : m, of the widest door; least_area : m^2, of the smallest room
     """
-    walls = joined_behind_furniture(find_walls(xyz, normal, least_height=wall_height), partial(_is_free, grid))
+    walls = walls_of(grid, xyz, normal, wall_height=wall_height)
     return FloorPlan(walls, find_rooms(grid, walls, door_width=door_width, least_area=least_area))
+
+
+def walls_of(grid: Grid, xyz: np.ndarray, normal: np.ndarray, *, wall_height: float) -> list[Wall]:
+    """Find the walls in a cloud, joined where the grid shows no free floor between their pieces; arguments as of `make_floor_plan`."""
+    return joined_behind_furniture(find_walls(xyz, normal, least_height=wall_height), partial(_is_free, grid))
 
 
 def _is_free(grid: Grid, places: np.ndarray) -> np.ndarray:

@@ -47,10 +47,13 @@ def reach(grid: Grid, start: tuple[float, float], *, radius: float, allow_unknow
 
     walls : that rooms end at; without any they end at all obstacles
     """
-    cells = cost_layers.swept(grid, cost_layers.reachable(grid, start, radius=radius, allow_unknown=allow_unknown), radius=radius)
+    centres = cost_layers.reachable(grid, start, radius=radius, allow_unknown=allow_unknown)
+    cells = cost_layers.swept(grid, centres, radius=radius)
     is_free, cell_area = grid.state == 0, float(grid.resolution) ** 2
     rooms = find_rooms(grid, walls, door_width=DOOR_WIDTH, least_area=LEAST_AREA)
-    shares = zip(rooms.rooms, reached_share(rooms, grid, cells), strict=True)
+    # A robot too wide for a door still covers floor beyond it: it is in a room only where its centre is.
+    both = zip(*(reached_share(rooms, grid, some) for some in (cells, centres)), strict=True)
+    shares = zip(rooms.rooms, (covered if entered > 0.0 else entered for covered, entered in both), strict=True)
     return Reach(
         cells,
         np.count_nonzero(cells & is_free) * cell_area,

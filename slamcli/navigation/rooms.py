@@ -9,12 +9,13 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from slamcli.navigation.walls import Wall
+from slamcli.navigation.walls import Wall, between_faces
 from slamcli.schema import Grid
 
 DOOR_WIDTH = 1.2  # [m] of the widest door, if not told
 LEAST_AREA = 1.0  # [m^2] of the smallest room, likewise
 NARROWED = 0.85  # of the smaller room's half width: at a door it is narrower
+JAMBS = 2.0  # cells by which a door looks wider: at either side, a wall's last point lies short of the edge
 OUTLINE = 1.5  # cells that a room's outline may stray from its cells: the steps of a slanted wall
 NEIGHBOURS = ((-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1))
 
@@ -69,7 +70,7 @@ def find_rooms(grid: Grid, walls: list[Wall], *, door_width: float, least_area: 
     is_wall = _drawn(grid, walls)
     inside = _inside(grid, is_wall)
     distance = cv2.distanceTransform(np.pad(inside, 1).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)[1:-1, 1:-1] * cell
-    label = _flooded(distance, door_width=door_width)
+    label = _flooded(distance, door_width=door_width + JAMBS * cell)
     label = _without_small(label, least_area / cell**2)
     rooms = [_room(grid, label == number, is_wall, distance, number) for number in range(1, int(label.max(initial=0)) + 1)]
     return Rooms(label, np.asarray(grid.origin), rooms, _doors(grid, label, distance))
@@ -89,12 +90,18 @@ def _reaching(grid: Grid, walls: list[Wall]) -> Grid:
 
 
 def _drawn(grid: Grid, walls: list[Wall]) -> np.ndarray:
-    """Say which cells (H, W) walls run through."""
+    """Say which cells (H, W) walls run through, or lie between the two faces of one."""
     is_wall = np.zeros(grid.state.shape, dtype=np.uint8)
-    for wall in walls:
-        ends = (np.stack([wall.start, wall.end]) - grid.origin) / float(grid.resolution) - 0.5
-        start, end = np.rint(ends).astype(int).tolist()
-        cv2.line(is_wall, start, end, 1, 1)
+
+    def cells(*places: np.ndarray) -> np.ndarray:
+        return np.rint((np.stack(places) - grid.origin) / float(grid.resolution) - 0.5).astype(np.int32)
+
+    for k, wall in enumerate(walls):
+        start, end = cells(wall.start, wall.end).tolist()
+        cv2.line(is_wall, start, end, 1, 1, cv2.LINE_4)  # without a gap at which cells on both sides touch by their corners
+        for other in walls[:k]:
+            if (body := between_faces(wall, other)) is not None:
+                cv2.fillConvexPoly(is_wall, cells(*body), 1)
     return is_wall > 0
 
 

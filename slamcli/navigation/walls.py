@@ -23,9 +23,11 @@ LEAST_LENGTH = 0.6  # [m]
 LEAST_FILL = 0.5  # share of a wall's area, from its lowest to its highest point, that shows points
 FILL_CELL = 0.1  # [m] of that area's raster
 ONE_LINE, ONE_LINE_COSINE = 0.06, 0.9986  # [m] apart, and cosine of the turn, of two pieces of one wall at most
+THICKEST = 0.4  # [m] of a wall whose two faces were seen
 SAMPLED = 0.025  # [m] step in which the gap between them is looked at
 CORNER = 0.5  # [m] from the ends of two walls to where their lines meet, at most, for a corner
 HIDDEN_CORNER = 2.5  # [m] likewise, where no free floor was seen on the way: furniture hides the ends
+OVERSHOOT = 0.2  # [m] beyond a corner that points of something else may draw the end of a wall; a wall seen farther beyond it goes on there
 CORNER_SINE = 0.5  # of the angle between them
 
 
@@ -60,7 +62,8 @@ def find_walls(xyz: np.ndarray, normal: np.ndarray, *, least_height: float) -> l
         claimed[on] = True
         claimed[votes.voters] = True  # so that the search ends, whatever the fit did
         is_left &= ~claimed
-        walls += _cut(points[on], n, rho, least_height)
+        if len(on):
+            walls += _cut(points[on], n, rho, least_height)
     return _joined(walls)
 
 
@@ -87,7 +90,8 @@ class _Votes:
         count = np.bincount(self._bin[is_left], minlength=N_ANGLES * self._n_distances).reshape(N_ANGLES, -1)
         around = count + np.roll(count, 1, axis=0) + np.roll(count, -1, axis=0)
         around[:, 1:-1] = around[:, 1:-1] + around[:, :-2] + around[:, 2:]
-        angle, distance = divmod(int(np.argmax(around)), self._n_distances)
+        # Of neighbours that all count the same votes, the one that most of them are for: beside it, a line would miss them far from the origin.
+        angle, distance = divmod(int(np.argmax(around * (count.max() + 1) + count)), self._n_distances)
         if around[angle, distance] < LEAST_VOTES:
             return None
         apart = (self._angle - angle + 1) % N_ANGLES
@@ -98,8 +102,8 @@ class _Votes:
 
 
 def _fit(xy: np.ndarray, facing: np.ndarray, left: np.ndarray, n: np.ndarray, rho: float) -> tuple[np.ndarray, float, np.ndarray]:
-    """Fit a line to the points near it; returns its normal, its distance from the origin, and its points."""
-    on = left
+    """Fit a line to the points near it; returns its normal, its distance from the origin, and its points: none where too few lie on one line."""
+    on = left[:0]
     for width, cosine in FITS:
         is_on = (np.abs(xy[left] @ n - rho) < width) & (facing[left] @ n > cosine)
         if np.count_nonzero(is_on) < LEAST_VOTES // 2:
@@ -173,21 +177,36 @@ def _joined(walls: list[Wall], is_free: Callable[[np.ndarray], np.ndarray] | Non
         for e, end in enumerate((wall.start, wall.end)):
             corners = [corner for other in walls if other is not wall and (corner := _corner(wall, other, is_free)) is not None]
             other_end, reach = wall.end if e == 0 else wall.start, CORNER if is_free is None else HIDDEN_CORNER
-            near = [corner for corner in corners if np.linalg.norm(corner - end) < min(reach, float(np.linalg.norm(corner - other_end)))]
+            outwards = (end - other_end) / max(float(np.linalg.norm(end - other_end)), SAMPLED)
+            near = [corner for corner in corners if -OVERSHOOT < (corner - end) @ outwards < reach]
             if near:
                 ends[k][e] = min(near, key=lambda corner: float(np.linalg.norm(corner - end)))
     return [replace(wall, start=start, end=end) for wall, (start, end) in zip(walls, ends, strict=True)]
 
 
 def _corner(a: Wall, b: Wall, is_free: Callable[[np.ndarray], np.ndarray] | None) -> np.ndarray | None:
-    """Find where the lines of two walls meet; None where they hardly do, far from an end of either, or beyond free floor."""
+    """Find where the lines of two walls meet; None where they hardly do, far beyond an end of either, or beyond free floor."""
     normals = np.stack([a.normal, b.normal])
     if abs(np.linalg.det(normals)) < CORNER_SINE:
         return None
     corner = np.linalg.solve(normals, np.array([a.normal @ a.start, b.normal @ b.start]))
     for wall in (a, b):
-        end = min((wall.start, wall.end), key=lambda end: float(np.linalg.norm(corner - end)))
-        apart = np.linalg.norm(corner - end)
+        s = float((corner - wall.start) @ (wall.end - wall.start)) / wall.length
+        end, apart = (wall.start, -s) if s < 0.5 * wall.length else (wall.end, s - wall.length)  # negative: where another wall meets it
         if apart >= CORNER and (is_free is None or apart >= HIDDEN_CORNER or _has_door(end, corner, is_free)):
             return None
     return corner
+
+
+def between_faces(a: Wall, b: Wall) -> tuple[np.ndarray, ...] | None:
+    """Return the corners (2,) of what lies between two walls where they are the two faces of one; None where they are not."""
+    if a.normal @ b.normal > -ONE_LINE_COSINE:
+        return None
+    along = (a.end - a.start) / a.length
+    thick = (b.start - a.start) @ a.normal  # negative: b is behind a
+    first, last = sorted(((b.start - a.start) @ along, (b.end - a.start) @ along))
+    first, last = max(first, 0.0), min(last, a.length)
+    if not -THICKEST < thick < 0.0 or first >= last:
+        return None
+    near, far = a.start + first * along, a.start + last * along
+    return near, far, far + thick * a.normal, near + thick * a.normal
