@@ -27,17 +27,24 @@ from pathlib import Path
 import numpy as np
 
 from slamcli import artifacts, files
+from slamcli.cli.grid import kept_out
 from slamcli.config import toml
 from slamcli.config.options import Config
+from slamcli.console import stage_line
 from slamcli.datasets import images, open_dataset
 from slamcli.datasets.intrinsics import read_camera_file
 from slamcli.datasets.lists import read_list, read_pairs
+from slamcli.datasets.simulate import read_stamps
 from slamcli.errors import SlamError
-from slamcli.formats import cloud, dbow2, g2o, grid_map, octomap, trajectory, vocabulary_file
+from slamcli.evaluation import grid_truth
+from slamcli.formats import cloud, dbow2, g2o, grid_map, mask, octomap, rvl, trajectory, vocabulary_file
 from slamcli.geometry.camera import Camera
 from slamcli.geometry.octree import Octree
-from slamcli.runs import damage
-from slamcli.schema import Closures, Trajectory
+from slamcli.runs import damage, housekeeping, summary
+from slamcli.runs.run_directory import RunDir
+from slamcli.schema import Closures, Grid, Trajectory
+from slamcli.slam import doubt
+from slamcli.stages import NAMES
 from slamcli.vision import vocabulary
 
 SECONDS = 5.0  # that one input may take
@@ -56,6 +63,7 @@ class Parser:
     name: str  # of the file it reads
     seeds: tuple[bytes, ...]
     read: Callable[[Path], object]
+    others: tuple[tuple[str, bytes], ...] = ()  # files that are read along with it, in whose place a mutated one is put as often
 
 
 def main() -> int:
@@ -72,7 +80,7 @@ def main() -> int:
     os.dup2(mute, 2)  # libpng and its like tell of every fault
     n_failures = 0
     with tempfile.TemporaryDirectory(dir="/dev/shm" if Path("/dev/shm").is_dir() else None) as folder:
-        known = {**parsers(), **recordings(Path(folder) / "recordings")}
+        known = {**parsers(), **recordings(Path(folder) / "recordings"), **runs(Path(folder) / "runs")}
         if unknown := set(given.parsers) - known.keys():
             options.error(f"no such parser: {', '.join(sorted(unknown))}; there are {', '.join(known)}")
         for name in given.parsers or known:
@@ -113,11 +121,15 @@ class Failure:
 def fuzz(parser: Parser, folder: Path, *, inputs: int, seed: int, tally: Tally) -> Iterator[Failure]:
     """Try so many inputs; yields the failures, one of each kind."""
     rng, seen = random.Random(f"{seed} {parser.name}"), set()
+    targets = [(parser.name, parser.seeds), *((name, (good,)) for name, good in parser.others)]
     for number in range(inputs):
-        data = mutated(rng, parser.seeds)
+        name, seeds = rng.choice(targets)
+        data = mutated(rng, seeds)
         started = time.perf_counter()
-        error = attempt(parser, folder, data)
+        error = attempt(parser, folder, data, name=name)
         took = time.perf_counter() - started
+        if parser.others:
+            (folder / name).write_bytes(seeds[0])
         tally.slowest = max(tally.slowest, took)
         if error is None:
             tally.read += 1
@@ -131,13 +143,13 @@ def fuzz(parser: Parser, folder: Path, *, inputs: int, seed: int, tally: Tally) 
             if kind not in seen:
                 seen.add(kind)
                 yield Failure(
-                    number, data, f"{parser.name} {number}: {type(error).__name__}: {str(error)[:200]} at {Path(kind[1]).name}:{kind[2]}"
+                    number, data, f"{name} {number}: {type(error).__name__}: {str(error)[:200]} at {Path(kind[1]).name}:{kind[2]}"
                 )
 
 
-def attempt(parser: Parser, folder: Path, data: bytes, *, bound: Callable | None = None) -> BaseException | None:
-    """Read one input within the bounds; returns what was raised."""
-    path = folder / parser.name
+def attempt(parser: Parser, folder: Path, data: bytes, *, name: str = "", bound: Callable | None = None) -> BaseException | None:
+    """Read one input within the bounds, in the place of the file `name`, the parser's first by default; returns what was raised."""
+    path = folder / (name or parser.name)
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(data)
     try:
@@ -217,6 +229,10 @@ def parsers() -> dict[str, Parser]:
     poses = Trajectory(np.arange(4.0), np.tile(np.eye(4), (4, 1, 1)))
     edges = (np.array([[1, 0], [2, 1]]), np.tile(np.eye(4), (2, 1, 1)), np.tile(np.eye(6), (2, 1, 1)))
     state = grid_map.GridMap(rng.integers(-1, 2, (4, 5)).astype(np.int8), (0.5, -1.0), 0.05)
+    unknown = np.full((4, 5), np.nan, np.float32)
+    cells = Grid(
+        state=state.state, origin=np.array(state.origin), resolution=np.array(0.05), n_seen=np.zeros((4, 5), np.int32), p_occupied=unknown
+    )
     camera = Camera(width=8, height=6, fx=8.0, fy=8.0, cx=4.0, cy=3.0)
     tum_list = b"# stamp file\n1.0 rgb/1.png\n2.0 rgb/2.png\n3.5 rgb/3.png\n"
     pairs = b"1.0 rgb/1.png 1.01 depth/1.png\n2.0 rgb/2.png 2.01 depth/2.png\n"
@@ -246,6 +262,14 @@ def parsers() -> dict[str, Parser]:
         data = images.read_bytes(path)
         return images.decode_grey(data, SIZE, name="x"), images.decode_depth(data, SIZE, name="x")
 
+    def keep_out(path: Path) -> object:
+        return kept_out(cells, path)
+
+    def scene(path: Path) -> object:
+        room = grid_truth.read_scene(path)
+        grid_truth.cast(room, np.zeros(3), np.eye(3))
+        return room.occupied(np.zeros((4, 2)), 0.1, 0.5)
+
     return {
         "config": Parser("config.toml", (toml.dump(Config()).encode(), b"[camera]\nfx = 500.0\n[extract]\nfeatures = 700\n"), sections),
         "assignment": Parser("assignment", (b"track.min_inliers=20", b"match.vocabulary=\"words.npz\"", b"optimize.enabled=false"), assignment),
@@ -266,12 +290,17 @@ def parsers() -> dict[str, Parser]:
         "vocabulary": Parser("v.npz", written("v.npz", lambda path: vocabulary_file.write(path, words)), vocabulary_file.read),
         "dbow2": Parser("v.txt", written("v.txt", lambda path: dbow2.write(path, dbow2.Tree(2, 2, words.parent, words.centre[1:], words.node_weight))), read_dbow2),
         "npy": Parser("x.npy", written("closure_T_ij.npy", lambda path: artifacts.save(closures, path.parent)), record),
+        "scene": Parser("scene.json", (json.dumps(SCENE, indent=1).encode(),), scene),
+        "stamps": Parser("stamps.txt", (b"# colour depth\n1.0 1.01\n1.04 1.05\n", b"1 2\n3 4\n"), read_stamps),
+        "keep_out": Parser("areas.json", (b"[[[0, -0.5], [0.1, -0.9], [0.2, -0.7]], [[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0, 1]]]",), keep_out),
+        "mask": Parser("mask", tuple(encoded(kind, rng, depth=False) for kind in (".png", ".bmp")), lambda path: mask.read_mask(path, SIZE[::-1])),
+        "rvl": Parser("rvl", (rvl.encode(rng.integers(0, 3, SIZE[::-1]) * rng.integers(500, 3000, SIZE[::-1])),), lambda path: rvl.decode(path.read_bytes(), *SIZE)),
         "image": Parser("picture", tuple(encoded(kind, rng) for kind in (".png", ".jpg", ".tiff", ".bmp", ".gif", ".pgm", ".exr")), picture),
     }  # fmt: skip
 
 
 def recordings(folder: Path) -> dict[str, Parser]:
-    """Make a recording of two frames in every layout that can be written here; the largest of its files that are no pictures is mutated."""
+    """Make a recording of two frames in every layout that can be written here; one of its files is mutated, each as often as the others."""
     sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
     import layouts  # writers that are independent of our readers
 
@@ -288,13 +317,44 @@ def recordings(folder: Path) -> dict[str, Parser]:
             root = layout.write(content, out)
         except ImportError:
             continue
-        target = max(
-            (path for path in out.rglob("*") if path.is_file()), key=lambda path: (path.suffix not in (".png", ".jpg"), path.stat().st_size)
-        )
-        found[f"layout {layout.name}"] = Parser(
-            str(target.relative_to(folder.parent)), (target.read_bytes(),), lambda _, root=root: play(root)
-        )
+        paths = sorted((path for path in out.rglob("*") if path.is_file()), key=lambda path: (path.suffix in (".png", ".jpg"), path))
+        first, *others = ((str(path.relative_to(folder.parent)), path.read_bytes()) for path in paths)
+        found[f"layout {layout.name}"] = Parser(first[0], (first[1],), lambda _, root=root: play(root), tuple(others))
     return found
+
+
+def runs(folder: Path) -> dict[str, Parser]:
+    """Make a finished run; one of the files that say what it is is mutated and sealed anew, as a forger would."""
+    sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+    import finished
+
+    run = finished.make(folder, frames=20).run
+    first, *others = (
+        (str(path.relative_to(folder.parent)), path.read_bytes())
+        for path in (run / "run.json", run / "config.toml", *sorted(run.glob("*/stage.json")))
+    )
+    return {"forged run": Parser(first[0], (first[1],), forged, tuple(others))}
+
+
+def forged(path: Path) -> None:
+    """Seal a file of a run anew, so that what lies behind the seal is reached, and ask what the run is."""
+    if path.name == "config.toml":
+        text = path.read_bytes().partition(damage.SEAL.encode())[0]
+        path.write_bytes(text + damage.seal(text))
+    else:
+        try:
+            files.write_sealed(path, {name: value for name, value in json.loads(path.read_bytes()).items() if name != files.SEAL})
+        except (ValueError, AttributeError, RecursionError) as error:
+            raise SlamError("no object of JSON") from error
+    run = RunDir.find(str(path.parent if path.name != "stage.json" else path.parents[1]))
+    run.states(run.config())
+    records = {stage: run.record(stage) for stage in NAMES}
+    doubt.verdict(doubt.from_records(records))
+    for record in records.values():
+        if record is not None:
+            stage_line(record)
+    summary.outcome(run)
+    housekeeping.list_runs(run.path.parent)
 
 
 def play(root: Path) -> None:
@@ -316,6 +376,15 @@ def read_dbow2(path: Path) -> object:
 
 ASCII_PLY = b"ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\nend_header\n0 1 2\n3 4 5\n"
 ASCII_PCD = b"FIELDS x y z rgb\nSIZE 4 4 4 4\nTYPE F F F U\nCOUNT 1 1 1 1\nWIDTH 2\nHEIGHT 1\nPOINTS 2\nDATA ascii\n0 1 2 3\n4 5 6 7\n"
+
+
+SCENE = {
+    "room": {"min": [-3, -2, 0], "max": [3.0, 2.0, 2.5]},
+    "obstacles": [
+        {"type": "box", "name": "table", "centre": [1.0, 0.5, 0.4], "size": [1.0, 0.6, 0.8], "yaw": 0.3},
+        {"type": "cylinder", "name": "post", "centre": [-1.0, 0.5, 0.5], "radius": 0.2, "height": 1.0},
+    ],
+}
 
 
 def encoded(kind: str, rng: np.random.Generator, *, depth: bool = True) -> bytes:

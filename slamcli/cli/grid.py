@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from slamcli import files
 from slamcli.cli.common import Mount, Target, json_option, mount_option, run_option
 from slamcli.errors import SlamError
 
@@ -78,7 +79,7 @@ def export_grid(
         radius = folder.config().robot.radius if radius is None else radius
         written = (*written, *write_costs(costs, cost_layers.inflated(grid, radius=radius, reach=reach, falloff=falloff)))
     if keep_out is not None:
-        is_kept_out = _kept_out(grid, keep_out)
+        is_kept_out = kept_out(grid, keep_out)
         written = (*written, *write_costs(out.with_name(f"{out.stem}_keepout.pgm"), 100 * is_kept_out.astype(np.int16)))
     rows, columns = grid.state.shape
     if as_json:
@@ -89,7 +90,7 @@ def export_grid(
     click.echo(f"{', '.join(str(path) for path in written)}: {columns} x {rows} cells of {float(grid.resolution):g} m", err=True)
 
 
-def _kept_out(grid: Grid, path: Path) -> np.ndarray:
+def kept_out(grid: Grid, path: Path) -> np.ndarray:
     """Read polygons or a drawn picture as cells (H, W) bool."""
     from slamcli.formats.mask import read_mask
     from slamcli.navigation import cost_layers
@@ -97,9 +98,9 @@ def _kept_out(grid: Grid, path: Path) -> np.ndarray:
     if path.suffix.lower() != ".json":
         return read_mask(path, grid.state.shape)[::-1]
     try:
-        polygons = json.loads(path.read_text(encoding="utf-8"))
+        polygons = json.loads(files.read_bytes(path, limit=files.LARGEST_JSON).decode("utf-8"))
         return cost_layers.inside_polygons(grid, polygons)
-    except (ValueError, TypeError, RecursionError) as error:
+    except (ValueError, TypeError, OverflowError, RecursionError) as error:
         raise SlamError(f"{path}: not a list of polygons [[[x, y], ...], ...]") from error
     except SlamError as error:
         raise SlamError(f"{path}: {error}") from error

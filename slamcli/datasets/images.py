@@ -114,12 +114,12 @@ def image_size(data: bytes) -> tuple[int, int] | None:
 
 def picture_size(picture: Picture, name: str) -> tuple[int, int]:
     """Return (width, height) of a picture, from its header where that says it; BadFrame where it is no picture."""
-    if isinstance(picture, Pixels):
-        return picture.size
-    found = image_size(picture)
+    found = picture.size if isinstance(picture, Pixels) else image_size(picture)
     if found is None:
         height, width = _decode(picture, cv2.IMREAD_UNCHANGED, name).shape[:2]
         found = width, height
+    if 0 in found:
+        raise BadFrame(f"{name}: has no pixel ({found[0]} x {found[1]} px)")
     return found
 
 
@@ -239,6 +239,8 @@ def _check_size(data: bytes, size: tuple[int, int] | None, name: str) -> None:
 
 
 def _decode(data: bytes, flags: int, name: str, size: tuple[int, int] | None = None) -> np.ndarray:
+    if data.startswith(png.MAGIC) and not png.is_whole(data):
+        raise BadFrame(f"{name}: PNG is cut off")
     try:
         image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION)
     except cv2.error as error:

@@ -8,6 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from slamcli.datasets.lists import read_text
 from slamcli.datasets.simulated import building, drive, noise, people, room
 from slamcli.datasets.simulated.drive import Motion
 from slamcli.datasets.simulated.figures import Figure
@@ -168,7 +169,7 @@ def _around_trajectory(what: Simulation, trajectory: Path) -> tuple[Scene, Motio
     T_lw = np.eye(4)
     T_lw[2, 3] = lift
     followed = Trajectory(stamp=followed.stamp, T_wc=product(T_lw, followed.T_wc))
-    stamps = _read_stamps(what.stamps) if what.stamps is not None else None
+    stamps = read_stamps(what.stamps) if what.stamps is not None else None
     motion = drive.along(followed, stamps, rate=what.rate, frames=what.frames)
     centres = np.concatenate([motion.colour_T_lc[:, :3, 3], motion.depth_T_lc[:, :3, 3]])
     low, high = centres.min(axis=0) - AROUND_TRAJECTORY, centres.max(axis=0) + AROUND_TRAJECTORY
@@ -181,14 +182,12 @@ def _around_trajectory(what: Simulation, trajectory: Path) -> tuple[Scene, Motio
     ), motion
 
 
-def _read_stamps(path: Path) -> np.ndarray:
+def read_stamps(path: Path) -> np.ndarray:
     """Read lines ``colour_stamp depth_stamp``."""
     expected = f"{path}: expected lines 'colour_stamp depth_stamp'"
     try:
-        lines = [line.split("#")[0].split() for line in path.read_text(encoding="utf-8", errors="replace").splitlines()]
+        lines = [line.split("#")[0].split() for line in read_text(path).splitlines()]
         rows = np.array([[float(token) for token in line] for line in lines if line])
-    except OSError as error:
-        raise SlamError(f"{path}: cannot be read ({error.strerror})") from error
     except ValueError as error:
         raise SlamError(f"{expected} ({error})") from error
     if rows.ndim != 2 or rows.shape[1] != 2 or not np.isfinite(rows).all():

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from slamcli import files
 from slamcli.errors import SlamError
 from slamcli.geometry import se3
 from slamcli.geometry.camera import Camera
@@ -20,6 +21,7 @@ from slamcli.schema import Grid
 SUBCELLS = 5  # samples along a cell's side
 ON_FLOOR = 1e-6  # [m]
 OUTLINE_POINTS = 3  # points of the band a cell must have shown to count as a seen outline
+LARGEST = 1e6  # [m] of a scene, so that no square overflows
 SPECIAL = ("hanging_box", "low_box")
 
 
@@ -42,13 +44,32 @@ class Scene:
 def read_scene(path: Path) -> Scene:
     """Read scene.json; SlamError when it is not one."""
     try:
-        about = json.loads(Path(path).read_text(encoding="utf-8"))
-        room = about["room"]
-        return Scene(np.array(room["min"], dtype=float), np.array(room["max"], dtype=float), list(about["obstacles"]))
+        about = json.loads(files.read_bytes(path, limit=files.LARGEST_JSON).decode("utf-8"))
+        low, high = (_numbers(about["room"][name], 3) for name in ("min", "max"))
+        return Scene(np.array(low), np.array(high), [_solid(one) for one in about["obstacles"]])
     except OSError as error:
         raise SlamError(f"{path}: cannot be read ({error.strerror}); only simulated recordings have it") from error
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
         raise SlamError(f"{path}: not the scene of a simulated recording") from error
+
+
+def _solid(about: dict[str, Any]) -> dict[str, Any]:
+    """Check a box or a cylinder of scene.json; ValueError, KeyError or TypeError where it is neither."""
+    if about["type"] not in ("box", "cylinder"):
+        raise ValueError(about["type"])
+    sizes = (
+        {"size": _numbers(about["size"], 3), "yaw": _numbers([about["yaw"]], 1)[0]}
+        if about["type"] == "box"
+        else dict(zip(("radius", "height"), _numbers([about["radius"], about["height"]], 2), strict=True))
+    )
+    return {**about, **sizes, "centre": _numbers(about["centre"], 3), "name": str(about["name"])}
+
+
+def _numbers(values: Any, n: int) -> list[float]:
+    found = [float(value) for value in values]
+    if len(found) != n or not np.isfinite(found).all() or np.abs(found).max() > LARGEST:
+        raise ValueError(f"{n} finite numbers are expected")
+    return found
 
 
 def footprint(solid: dict[str, Any], xy: np.ndarray, low: float, high: float) -> np.ndarray:

@@ -22,7 +22,10 @@ def read_grey(path: Path, *, max_pixels: int) -> np.ndarray:
     columns, rows = _size(data)
     if columns * rows > max_pixels:
         raise SlamError(f"{path}: {columns} x {rows} pixels are too many")
-    picture = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_GRAYSCALE) if columns * rows else None
+    try:
+        picture = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_GRAYSCALE) if columns * rows else None
+    except cv2.error as error:
+        raise SlamError(f"{path}: cannot be decoded ({error.err})") from error
     if picture is None:
         raise SlamError(f"{path}: not a picture in PNG or BMP")
     return picture

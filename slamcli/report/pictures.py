@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from slamcli.errors import SlamError
+from slamcli.errors import Damaged, SlamError
 from slamcli.evaluation.run_content import Content
 from slamcli.formats import cloud, octomap
 from slamcli.navigation import planner
@@ -55,6 +55,8 @@ def draw(run: RunDir, content: Content) -> list[Picture]:
         try:
             picture = painter(run, title, path)
             found += [] if picture is None else [picture]
+        except Damaged:
+            raise
         except SlamError as error:
             found.append(Picture(title, f"Not drawn: {error}", ""))
     return found

@@ -8,7 +8,7 @@ from typing import Any
 
 from slamcli.config import toml
 from slamcli.config.options import Config
-from slamcli.errors import SlamError
+from slamcli.errors import Damaged, SlamError
 from slamcli.files import read_bytes, sha256, write_bytes
 
 OTHER_VERSION = " (another version of slamcli made this run; start another one with -r)"
@@ -61,11 +61,11 @@ def find(folder: Path, outputs: Mapping[str, Any], names: Iterable[str], *, veri
 def write_config(path: Path, config: Config) -> None:
     """Write a configuration that `read_config` finds unchanged."""
     text = toml.dump(config).encode()
-    write_bytes(path, text + _seal(text))
+    write_bytes(path, text + seal(text))
 
 
 def read_config(path: Path) -> Config:
-    """Read a run's configuration; SlamError when a single bit of it is another than when it was written.
+    """Read a run's configuration; Damaged when a single bit of it is another than when it was written.
 
     A file cut short may still be valid TOML, and would silently fall back to the defaults.
     """
@@ -75,8 +75,8 @@ def read_config(path: Path) -> Config:
 @functools.lru_cache(maxsize=8)  # every step of a command asks for it
 def _sealed_config(data: bytes, source: str) -> Config:
     text = data[: data.rfind(SEAL.encode())] if SEAL.encode() in data else b""
-    if text + _seal(text) != data:
-        raise SlamError(
+    if text + seal(text) != data:
+        raise Damaged(
             f"{source}: not as slamcli wrote it; slamcli run restores it from what the stages recorded, "
             "or takes your changes with -s section.key=value or --config FILE"
         )
@@ -86,7 +86,8 @@ def _sealed_config(data: bytes, source: str) -> Config:
         raise SlamError(f"{error}{OTHER_VERSION}") from error
 
 
-def _seal(text: bytes) -> bytes:
+def seal(text: bytes) -> bytes:
+    """Return the last line of a configuration, which holds the digest of all above it."""
     return f"{SEAL}{hashlib.sha256(text).hexdigest()}\n".encode()
 
 

@@ -18,11 +18,11 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from slamcli import files
 from slamcli.config.options import Config
-from slamcli.errors import SlamError
+from slamcli.errors import Damaged, SlamError
 from slamcli.runs import damage, source_code, staleness
 from slamcli.runs.staleness import State
 from slamcli.schema import FORMAT
-from slamcli.stages import NAMES, STAGES
+from slamcli.stages import NAMES, STAGES, basis
 
 if TYPE_CHECKING:
     from slamcli.datasets import Dataset
@@ -138,7 +138,7 @@ class RunDir:
                 info = files.read_json(path)
                 if files.SEAL not in info and info.get("format") not in (None, FORMAT):  # older, not damaged
                     return info
-            raise SlamError(f"{error}; restore it with: slamcli run {self.flag}, or: slamcli run TARGET {self.flag}") from error
+            raise Damaged(f"{error}; restore it with: slamcli run {self.flag}, or: slamcli run TARGET {self.flag}") from error
 
     def _write_info(self, info: Mapping[str, Any]) -> None:
         now = datetime.now(UTC).isoformat(timespec="seconds")
@@ -236,18 +236,18 @@ class RunDir:
         return path
 
     def intact(self, stage: str, *names: str) -> Path:
-        """Return the folder of a finished stage after comparing files of it with the digests recorded; SlamError where one differs."""
+        """Return the folder of a finished stage after comparing files of it with the digests recorded; Damaged where one differs."""
         record = self.record(stage) or {"outputs": {}}
         for name in names:
             if name not in record["outputs"]:
                 raise SlamError(f"{self.path / stage / name}: not there; make it with: slamcli {stage} {self.flag}")
         if found := damage.find(self.path / stage, record["outputs"], names, verify=True):
-            raise SlamError(f"{self.path}/{found}: it is damaged; repair it with: slamcli run {self.flag}")
+            raise Damaged(f"{self.path}/{found}: it is damaged; repair it with: slamcli run {self.flag}")
         return self.path / stage
 
     def _warn_unless_fresh(self, stage: str) -> None:
         """Say once that a result is not what the run's configuration would give now."""
-        if stage in self._warned or (state := self.states()[stage]).is_fresh or self.is_cleaned(state):
+        if stage in self._warned or (state := self.states(until=stage)[stage]).is_fresh or self.is_cleaned(state):
             return
         if state.reason not in self._warned:  # of several stages that are stale for one reason, one tells it
             log.warning(
@@ -270,19 +270,23 @@ class RunDir:
         if state.stage in cleaned and state.state == staleness.MISSING:
             return True
         needed = state.reason.removeprefix("input: ").partition(" is ")[0]
-        return needed in NAMES and NAMES.index(needed) < NAMES.index(state.stage) and self.is_cleaned(self.states()[needed])
+        return needed in NAMES and NAMES.index(needed) < NAMES.index(state.stage) and self.is_cleaned(self.states(until=needed)[needed])
 
     def states(
         self,
         config: Config | None = None,
         *,
         verify: bool = False,
+        until: str | None = None,
         input_digest: Callable[[str], str | None] = lambda name: None,
     ) -> dict[str, State]:
-        """Judge every stage under `config` (the run's own); without `input_digest` the recording is believed to be unchanged."""
+        """Judge every stage under `config` (the run's own); without `input_digest` the recording is believed to be unchanged.
+
+        until : judge no more than this stage and those that it rests on
+        """
         config = config or self.config()
         states: dict[str, State] = {}
-        for stage in STAGES:
+        for stage in STAGES if until is None else [stage for stage in STAGES if stage.name in basis(until)]:
             found = self.damage(stage.name, verify=verify)
             record = None if found else self.record(stage.name)
             sources = source_code.of_stage(stage.name, (record or {}).get("reader", ""))
@@ -290,16 +294,16 @@ class RunDir:
         return states
 
     def record(self, stage: str) -> dict[str, Any] | None:
-        """Read a stage's ``stage.json``; None before it was run. SlamError when it cannot be what this program wrote."""
+        """Read a stage's ``stage.json``; None before it was run. Damaged when it cannot be what this program wrote."""
         path = self.path / stage / "stage.json"
         if not path.parent.is_dir():
             return None
         try:
             record = files.read_sealed(path)
         except SlamError as error:
-            raise SlamError(f"{error}; repair it with: slamcli run {self.flag}") from error
+            raise Damaged(f"{error}; repair it with: slamcli run {self.flag}") from error
         if "format" not in record or (record["format"] == FORMAT and not damage.is_record(record)):
-            raise SlamError(f"{path}: not a stage's record; repair it with: slamcli run {self.flag}")
+            raise Damaged(f"{path}: not a stage's record; repair it with: slamcli run {self.flag}")
         return record
 
     def damage(self, stage: str, *, verify: bool = False) -> str:

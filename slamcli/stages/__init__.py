@@ -44,6 +44,11 @@ STAGES = (
 NAMES = tuple(stage.name for stage in STAGES)
 
 
+def basis(name: str) -> set[str]:
+    """Name a stage and all that it rests on, directly or not."""
+    return {name}.union(*(basis(need) for need in stage_named(name).needs if need in NAMES))
+
+
 def stage_named(name: str) -> Stage:
     """Look up a row of the table."""
     return STAGES[NAMES.index(name)]

@@ -316,7 +316,7 @@ def test_costs_and_keep_out_layers_lie_on_the_grid(slamcli, run, tmp_path):
     cv2.imwrite(str(tmp_path / "no.png"), drawn)
     assert slamcli("export-grid", tmp_path / "n.pgm", "-r", run, "--keep-out", tmp_path / "no.png").exit_code == 0
     assert (tmp_path / "n_keepout.pgm").read_bytes() == (tmp_path / "m_keepout.pgm").read_bytes()
-    for content in ("{", "[[1, 2]]", "5"):
+    for content in ("{", "[[1, 2]]", "5", f"[[[1{'0' * 400}, 0], [1, 1], [0, 1]]]", "[" * 10_000):
         (tmp_path / "no.json").write_text(content)
         result = slamcli("export-grid", tmp_path / "x.pgm", "-r", run, "--keep-out", tmp_path / "no.json")
         assert result.exit_code == 1 and "no.json" in result.stderr

@@ -126,6 +126,17 @@ def test_a_zip_bomb_is_refused_before_it_is_unpacked(tmp_path: Path) -> None:
         open_dataset(str(tmp_path / "scan.r3d"))
 
 
+def test_metadata_packed_in_a_way_that_is_not_known_are_told(tmp_path: Path) -> None:
+    with zipfile.ZipFile(tmp_path / "scan.r3d", "w") as archive:
+        archive.writestr("metadata", b"{}")
+        archive.writestr("rgbd/0.jpg", b"")
+    data = (tmp_path / "scan.r3d").read_bytes()
+    for at, value in ((data.index(b"PK\1\2") + 10, 77), (data.index(b"PK\1\2") + 8, 1)):  # the method, and that it is encrypted
+        (tmp_path / "scan.r3d").write_bytes(data[:at] + bytes([value]) + data[at + 1 :])
+        with pytest.raises(SlamError, match="its metadata cannot be parsed"):
+            open_dataset(str(tmp_path / "scan.r3d"))
+
+
 @pytest.mark.parametrize("is_cdr", [False, True])
 def test_messages_cut_anywhere_are_told(content: Content, is_cdr: bool) -> None:
     """The parser meets every prefix of a real message."""

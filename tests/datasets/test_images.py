@@ -132,3 +132,11 @@ def test_large_pictures_are_averaged_without_a_shift(suffix: str, reduction: int
     assert abs(float((small - expected).mean())) < 0.35 and np.abs(small - expected)[2:-2, 2:-2].max() < 3.0
     rgb = images.decode_rgb(data, size, name="ramp", reduction=reduction)
     assert rgb.shape == (*small.shape, 3) and np.abs(rgb[..., 1].astype(int) - small).max() <= 2
+
+
+def test_a_picture_without_a_pixel_is_a_bad_frame() -> None:
+    data = bytearray(cv2.imencode(".png", np.zeros((4, 5), np.uint8))[1].tobytes())
+    assert images.picture_size(bytes(data), "p.png") == (5, 4)
+    data[16:24] = bytes(8)
+    with pytest.raises(BadFrame, match=r"p\.png: has no pixel"):
+        images.picture_size(bytes(data), "p.png")

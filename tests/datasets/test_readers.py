@@ -130,6 +130,18 @@ def test_files_that_are_cut_off_are_told(written: tuple[Layout, Path], tmp_path:
     _opens_or_is_told(layout, copied)
 
 
+def test_a_second_camera_without_all_its_intrinsics_is_told(content: Content, tmp_path: Path) -> None:
+    root = layouts.scannet(content, tmp_path / "scan")
+    open_dataset(str(root))
+    for name in ("depth", "color"):
+        path = root / "intrinsic" / f"intrinsic_{name}.txt"
+        good = path.read_text()
+        path.write_text("fx: 500.0\ncx: 4.0\n")
+        with pytest.raises(SlamError, match="camera lacks fy, cy"):
+            open_dataset(str(root))
+        path.write_text(good)
+
+
 def test_files_with_damaged_bytes_are_told(written: tuple[Layout, Path], tmp_path: Path) -> None:
     layout, path = written
     if path.is_dir() and not any(path.glob("*.db3")) and not any(path.glob("*.mcap")):

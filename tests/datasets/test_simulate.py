@@ -158,6 +158,12 @@ def test_settings_that_cannot_be_are_told(tmp_path: Path, settings: dict, said: 
     assert list(tmp_path.iterdir()) == []
 
 
+def test_stamps_from_a_device_are_refused(tmp_path: Path) -> None:
+    write_tum(tmp_path / "t.txt", Trajectory(stamp=np.arange(2.0), T_wc=np.tile(standing(), (2, 1, 1))))
+    with pytest.raises(SlamError, match="not a regular file"):
+        simulate(tmp_path / "r", progress=silent, trajectory=tmp_path / "t.txt", stamps=Path("/dev/zero"))
+
+
 @pytest.mark.parametrize("text", ["", "1 2 3\n", "a b\n", "nan 1\n"])
 def test_malformed_stamps_are_told(tmp_path: Path, text: str) -> None:
     write_tum(tmp_path / "t.txt", Trajectory(stamp=np.arange(2.0), T_wc=np.tile(standing(), (2, 1, 1))))

@@ -122,6 +122,23 @@ def test_a_file_that_is_no_scene(tmp_path, text):
         grid_truth.read_scene(tmp_path / "none.json")
 
 
+BOX = {"type": "box", "name": "b", "centre": [1, 1, 1], "size": [1, 1, 1], "yaw": 0.0}
+
+
+@pytest.mark.parametrize("solid", [
+    3, {}, {**BOX, "type": "cone"}, {**BOX, "centre": [1, 1]}, {**BOX, "size": [1, 1, 1, 1]}, {**BOX, "size": "111"}, {**BOX, "yaw": "x"},
+    {**BOX, "centre": [1e300, 0, 0]}, {**BOX, "centre": [10**400, 0, 0]}, {**BOX, "type": "cylinder"}, {**BOX, "type": ["box"]},
+    {name: value for name, value in BOX.items() if name != "name"},
+])  # fmt: skip
+def test_an_obstacle_that_is_none_is_told_when_the_scene_is_read(tmp_path, solid):
+    room = {"min": [0, 0, 0], "max": [8, 5, 2.5]}
+    (tmp_path / "scene.json").write_text(json.dumps({"room": room, "obstacles": [BOX]}))
+    grid_truth.read_scene(tmp_path / "scene.json")
+    (tmp_path / "scene.json").write_text(json.dumps({"room": room, "obstacles": [BOX, solid]}))
+    with pytest.raises(SlamError, match="not the scene"):
+        grid_truth.read_scene(tmp_path / "scene.json")
+
+
 def test_a_scene_is_read(tmp_path):
     about = {"room": {"min": [0, 0, 0], "max": [8, 5, 2.5]}, "obstacles": scene().solids}
     (tmp_path / "scene.json").write_text(json.dumps(about))

@@ -20,9 +20,9 @@ def test_a_picture_is_read_back(tmp_path: Path, ending: str) -> None:
         picture.read_grey(tmp_path / f"p{ending}", max_pixels=90)
 
 
-def huge_png() -> bytes:
-    """The header of a picture of 100000 x 100000, and little more."""
-    header = b"IHDR" + struct.pack(">IIBBBBB", 100_000, 100_000, 8, 0, 0, 0, 0)
+def png_of(width: int, height: int) -> bytes:
+    """The header of a picture of this size, and little more."""
+    header = b"IHDR" + struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
     return picture.PNG_MAGIC + struct.pack(">I", 13) + header + struct.pack(">I", zlib.crc32(header)) + b"IDAT"
 
 
@@ -33,9 +33,11 @@ def huge_png() -> bytes:
         (b"hello", "not a picture"),
         (picture.PNG_MAGIC, "not a picture"),
         (picture.BMP_MAGIC + bytes(40), "not a picture"),
-        (huge_png(), "100000 x 100000 pixels are too many"),
+        (png_of(100_000, 100_000), "100000 x 100000 pixels are too many"),
         (picture.BMP_MAGIC + bytes(16) + struct.pack("<ii", -100_000, 2**31 - 1) + bytes(30), "too many"),
         (picture.encoded(np.zeros((9, 9), np.uint8), ".png")[:40], "not a picture"),
+        (picture.BMP_MAGIC + bytes(16) + struct.pack("<ii", 1 << 21, 1) + bytes(30), "not a picture"),
+        (png_of(1 << 21, 1), "cannot be decoded"),  # wider than OpenCV allows
     ],
 )
 def test_what_is_no_picture_gives_one_line(tmp_path: Path, data: bytes, says: str) -> None:

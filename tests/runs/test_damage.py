@@ -205,7 +205,7 @@ def test_a_run_of_another_version_is_refused_and_stays_as_it_is(slamcli: Slamcli
 def test_a_run_with_an_option_of_another_version_says_so(tmp_path: Path) -> None:
     """The file is whole, so that the user has not mistyped: without a word of the version he would look for his own slip."""
     text = b"[densify]\nnoise_of_old = 0.5\n"
-    (tmp_path / "config.toml").write_bytes(text + damage._seal(text))
+    (tmp_path / "config.toml").write_bytes(text + damage.seal(text))
     with pytest.raises(SlamError, match=r"noise_of_old is not known.*another version of slamcli made this run; start another one with -r"):
         damage.read_config(tmp_path / "config.toml")
     with pytest.raises(SlamError, match="another version of slamcli made this run"):

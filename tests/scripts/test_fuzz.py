@@ -32,6 +32,18 @@ def test_the_good_file_is_read(name: str, tmp_path: Path) -> None:
         assert error is None or name == "image", error
 
 
+@pytest.mark.filterwarnings("ignore")
+def test_every_file_of_a_recording_and_of_a_run_is_read_or_refused_when_it_is_mutated(tmp_path: Path) -> None:
+    known = {**fuzz.recordings(tmp_path / "recordings"), **fuzz.runs(tmp_path / "runs")}
+    assert len(known) > 15
+    for name, parser in known.items():
+        error = fuzz.attempt(parser, tmp_path, parser.seeds[0], bound=contextlib.nullcontext)
+        assert error is None, (name, error)
+        tally = fuzz.Tally()
+        assert [failure.told for failure in fuzz.fuzz(parser, tmp_path, inputs=INPUTS, seed=0, tally=tally)] == []
+        assert all((tmp_path / other).read_bytes() == good for other, good in parser.others)
+
+
 def test_a_parser_that_fails_hangs_or_eats_memory_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fuzz, "SECONDS", 0.2)
 

@@ -124,7 +124,7 @@ def _metadata(archive: zipfile.ZipFile, path: Path) -> dict[str, Any]:
         about = json.loads(archive.read("metadata"))
     except KeyError:
         raise SlamError(f"{path}: holds no metadata; is it of Record3D?") from None
-    except (ValueError, RecursionError, zipfile.BadZipFile, OSError, EOFError) as error:
+    except (ValueError, RecursionError, zipfile.BadZipFile, OSError, EOFError, NotImplementedError, RuntimeError, zlib.error) as error:
         raise SlamError(f"{path}: its metadata cannot be parsed") from error
     if not isinstance(about, dict):
         raise SlamError(f"{path}: its metadata are no table")

@@ -45,9 +45,15 @@ def _calibration(folder: Path) -> Calibration:
 
 
 def of_two(colour: dict, depth: dict, T_bc: np.ndarray, T_bd: np.ndarray, source: str) -> Calibration:
-    """Return the calibration of both cameras, each with its pose on the body; equal ones mean that depth is registered."""
+    """Return the calibration of both cameras, each with its pose on the body; equal ones mean that depth is registered.
+
+    Raises SlamError where intrinsics of one of them are missing.
+    """
     T_cd = product(inverse(T_bc), T_bd)
     keys = ("fx", "fy", "cx", "cy")
+    for which, values in (("colour", colour), ("depth", depth)):
+        if missing := [key for key in keys if key not in values]:
+            raise SlamError(f"{source}: the calibration of the {which} camera lacks {', '.join(missing)}; copy it from the recorder again")
     is_same = all(abs(colour[key] - depth[key]) < 1e-6 for key in keys) and np.allclose(T_cd, np.eye(4), atol=1e-9)
     return Calibration(colour, source) if is_same else Calibration(colour, source, depth, T_cd)
 

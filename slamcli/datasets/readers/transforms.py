@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from slamcli import files
 from slamcli.datasets.calibration import Calibration, find_calibration
 from slamcli.datasets.folder import Folder, number_of
 from slamcli.datasets.intrinsics import from_value
@@ -58,9 +59,7 @@ def read(path: Path) -> Recorded:
 
 def _load(path: Path) -> dict[str, Any]:
     try:
-        if path.stat().st_size > MAX_BYTES:
-            raise SlamError(f"{path}: too large")
-        about = json.loads(path.read_text(encoding="utf-8"))
+        about = json.loads(files.read_bytes(path, limit=MAX_BYTES).decode("utf-8"))
     except (ValueError, RecursionError, OSError) as error:
         raise SlamError(f"{path}: cannot be parsed ({error})") from error
     if not isinstance(about, dict) or not isinstance(about.get("frames"), list):
