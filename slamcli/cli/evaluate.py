@@ -236,7 +236,7 @@ def _record(folder: RunDir, file: str, figures: dict) -> None:
     try:
         with files.written(target):
             target.parent.mkdir(exist_ok=True)
-            files.write_text(target, _json([figures]) + "\n")
+            files.write_sealed(target, figures)
     except SlamError as error:
         click.echo(f"Warning: {error}", err=True)
 

@@ -114,8 +114,11 @@ def image_size(data: bytes) -> tuple[int, int] | None:
 
 def picture_size(picture: Picture, name: str) -> tuple[int, int]:
     """Return (width, height) of a picture, from its header where that says it; BadFrame where it is no picture."""
-    found = picture.size if isinstance(picture, Pixels) else image_size(picture)
-    if found is None:
+    if isinstance(picture, Pixels):
+        found = picture.size
+    elif (header := image_size(picture)) is not None:
+        found = header
+    else:
         height, width = _decode(picture, cv2.IMREAD_UNCHANGED, name).shape[:2]
         found = width, height
     if 0 in found:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from slamcli.config import toml
-from slamcli.errors import SlamError
+from slamcli.errors import Damaged, SlamError
 from slamcli.evaluation import map_verdict, trajectory_error
 from slamcli.evaluation.map_verdict import Verdict
 from slamcli.formats import cloud
@@ -86,6 +86,8 @@ def _ape(run: RunDir, name: str) -> float | None:
         found = trajectory_error.ape(
             trajectory_error.stage_trajectory(run, stage), truth, n_frames=trajectory_error.frame_count(run), name=name, stage=stage
         )
+    except Damaged:
+        raise
     except SlamError:  # no truth, too few poses, or the recording is gone: there is nothing to compare with
         return None
     return trajectory_error.statistics(found.error)["rmse"]

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from slamcli import schema
-from slamcli.errors import SlamError
+from slamcli.errors import Damaged, SlamError
 from slamcli.evaluation import map_verdict, of_several, trajectory_error
 from slamcli.evaluation.map_verdict import Verdict
 from slamcli.evaluation.trajectory_error import Ape
@@ -136,6 +136,8 @@ def _ape(run: RunDir, stamp: np.ndarray, truth: Trajectory | None) -> dict[str, 
                 found[stage] = trajectory_error.ape(
                     trajectory_error.stage_trajectory(run, stage), truth, n_frames=len(stamp), name=stage, stage=stage
                 )
+            except Damaged:
+                raise
             except SlamError:  # too few poses to align: the page says how many there are
                 continue
     return found

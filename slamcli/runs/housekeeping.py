@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from slamcli import files
-from slamcli.errors import SlamError
+from slamcli.errors import Damaged, SlamError
 from slamcli.runs.run_directory import LATEST, RECORDINGS, RUNS, RunDir
 from slamcli.stages import NAMES
 
@@ -107,7 +107,7 @@ def archive(run: RunDir, out: Path, *, skip: Sequence[str] = ()) -> int:
     """Write a run's files to the zip file `out`, all or none; returns how many they are. The same run gives the same bytes.
 
     skip : stages that are left out; what is unpacked knows that they were, as after `clean`
-    Raises SlamError where a file is not what its stage recorded: what is kept for long is worth a look.
+    Raises Damaged where a file is not what its stage recorded: what is kept for long is worth a look.
     """
     if out.resolve().is_relative_to(run.path.resolve()):
         raise SlamError(f"{out}: lies in the run that is to be packed; choose another place")
@@ -127,9 +127,11 @@ def archive(run: RunDir, out: Path, *, skip: Sequence[str] = ()) -> int:
 
 def _check_intact(run: RunDir, skip: Sequence[str]) -> None:
     run.config()
+    if damaged := run.damaged_figures():
+        raise Damaged(f"{run.path / damaged[0]}: it is damaged; remove it with: slamcli run {run.flag}")
     for stage in NAMES:
         if stage not in skip and (found := run.damage(stage, verify=True)):
-            raise SlamError(f"{run.path}/{found}: it is damaged; repair it with: slamcli run {run.flag}")
+            raise Damaged(f"{run.path}/{found}: it is damaged; repair it with: slamcli run {run.flag}")
     for entry in run.recordings if RECORDINGS not in skip else ():
         own = RunDir(run.recording_path(entry["name"]))
         if own.path.is_dir():

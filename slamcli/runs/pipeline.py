@@ -170,6 +170,7 @@ class Pipeline:
     def notes(self, states: Mapping[str, State]) -> list[str]:
         """Say what is worth knowing beside the states: a recording that is gone, results made with other versions."""
         found = [self.recording_note] if self.recording_note else []
+        found += [f"{name} is damaged: slamcli run {self.run.flag} removes it" for name in self.run.damaged_figures()]
         here = environment()
         for name, value in here.items():
             stages: dict[str, list[str]] = {}

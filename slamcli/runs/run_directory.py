@@ -33,6 +33,7 @@ log = logging.getLogger(__name__)
 
 RUNS = Path("runs")
 LATEST = RUNS / "latest"
+FIGURES = ("eval/*.json", "inspection.json")  # what eval and report keep of their findings, each file sealed
 RECORDINGS = "recordings"  # folder of the runs of single recordings inside a run of several
 
 
@@ -159,13 +160,14 @@ class RunDir:
         damage.write_config(self.path / "config.toml", config)
 
     def restore(self) -> None:
-        """Write ``run.json`` and ``config.toml`` anew where they are damaged, from what the finished stages recorded."""
+        """Write ``run.json`` and ``config.toml`` anew where they are damaged, from what the finished stages recorded; drop damaged findings."""
         is_run = _has_stage(self.path) or ((self.path / ".lock").is_file() and (self.path / "run.json").exists())
         lacking = [name for name in ("run.json", "config.toml") if is_run and not self._is_sealed(name)]
-        if "run.json" not in lacking and lacking:
-            self._checked()  # a run of another version is not damaged: it is refused, and stays as it is
-        if not lacking:
+        figures = self.damaged_figures() if is_run else []
+        if not lacking and not figures:
             return
+        if "run.json" not in lacking:
+            self._checked()  # a run of another version is not damaged: it is refused, and stays as it is
         with self.lock():
             records = self._records()
             if "run.json" in lacking and (info := damage.restored_info(records)):
@@ -175,10 +177,19 @@ class RunDir:
                 self.write_config(damage.restored_config(records))
                 source = "what the stages recorded" if records else "the defaults, as no stage recorded its own"
                 log.warning("%s was damaged; restored from %s", self.path / "config.toml", source)
+            for name in figures:  # no stage makes them, the commands that found them do
+                (self.path / name).unlink(missing_ok=True)
+                log.warning("%s was damaged, and is removed; give slamcli eval or slamcli report again for it", self.path / name)
+
+    def damaged_figures(self) -> list[str]:
+        """Name the files in which `eval` and `report` kept their findings and that are not as they were written."""
+        names = [path.relative_to(self.path).as_posix() for pattern in FIGURES for path in sorted(self.path.glob(pattern))]
+        return [name for name in names if not self._is_sealed(name)]
 
     def _is_sealed(self, name: str) -> bool:
         try:
-            (self.info if name == "run.json" else lambda: damage.read_config(self.path / name))()
+            read = {"run.json": lambda _: self.info(), "config.toml": damage.read_config}.get(name, files.read_sealed)
+            read(self.path / name)
         except (SlamError, FileNotFoundError):
             return False
         return True

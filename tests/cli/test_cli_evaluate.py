@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from click.testing import Result
 
+from slamcli import files
 from slamcli.evaluation import trajectory_error
 from slamcli.formats.trajectory import read_tum, write_tum
 from slamcli.runs.run_directory import RunDir
@@ -35,7 +36,7 @@ def test_ape_as_json(slamcli: Command, made: finished.Finished) -> None:
     assert (figures["n_poses"], figures["n_frames"], figures["lost"]) == (84, 90, 6)
     assert 0.006 < figures["rmse"] < 0.011  # 0.005 m along three axes
     assert figures["rmse_scaled"] <= figures["rmse"]
-    assert json.loads((made.run / "eval" / "ape.json").read_text()) == figures
+    assert files.read_sealed(made.run / "eval" / "ape.json") == figures
 
 
 def test_ape_of_each_stage_is_that_of_its_trajectory_file(slamcli: Command, made: finished.Finished) -> None:
@@ -51,7 +52,7 @@ def test_ape_of_each_stage_is_that_of_its_trajectory_file(slamcli: Command, made
 def test_all_stages_in_one_table(slamcli: Command, made: finished.Finished) -> None:
     rows = json.loads(slamcli("eval", "ape", "-r", made.run, "--stage", "all", "--json").stdout)
     assert [row["stage"] for row in rows] == ["track", "optimize", "loop"]
-    assert json.loads((made.run / "eval" / "ape.json").read_text()) == rows[-1]
+    assert files.read_sealed(made.run / "eval" / "ape.json") == rows[-1]
 
 
 def test_run_that_may_not_be_written_to(slamcli: Command, made: finished.Finished, tmp_path: Path) -> None:
@@ -123,7 +124,7 @@ def test_rpe(slamcli: Command, made: finished.Finished) -> None:
     assert (figures["unit"], figures["delta"], figures["per_frame"]["unit"]) == ("s", 1.0, "frame")
     assert 0.008 < figures["rmse"] < 0.017  # two poses with 0.005 m along three axes
     assert figures["per_frame"]["n_pairs"] == 82  # 84 poses in two pieces
-    assert json.loads((made.run / "eval" / "rpe.json").read_text()) == figures
+    assert files.read_sealed(made.run / "eval" / "rpe.json") == figures
     lines = slamcli("eval", "rpe", "-r", made.run).stdout.splitlines()
     assert len(lines) == 3
 
@@ -175,7 +176,7 @@ def test_map_against_the_depth_images_and_the_scene(slamcli: Command, room_run: 
     figures = json.loads(slamcli("eval", "map", "-r", run, "--json").stdout)
     assert 0.9 < figures["octree"]["accuracy"] <= 1.0
     assert 0.5 < figures["grid"]["free_is_free"] <= 1.0
-    assert json.loads((run / "eval" / "map.json").read_text()) == figures
+    assert files.read_sealed(run / "eval" / "map.json") == figures
     text = slamcli("eval", "map", "-r", run).stdout
     assert "of the cells seen are right" in text
     assert "called free are free" in text

@@ -15,8 +15,8 @@ from slamcli import files
 from slamcli.cli.main import cli
 from slamcli.config import toml
 from slamcli.config.options import Config
-from slamcli.errors import SlamError
-from slamcli.runs import damage
+from slamcli.errors import Damaged, SlamError
+from slamcli.runs import damage, housekeeping
 from slamcli.runs.pipeline import Inputs, Pipeline
 from slamcli.runs.run_directory import RunDir
 from slamcli.schema import Features
@@ -117,12 +117,40 @@ def test_without_any_record_the_recording_must_be_named(pipeline: Pipeline) -> N
     assert info["root"] == "/elsewhere"
 
 
+def test_damaged_findings_are_named_and_removed_for_no_stage_makes_them(pipeline: Pipeline, caplog: pytest.LogCaptureFixture) -> None:
+    run = pipeline.run
+    (run.path / "eval").mkdir()
+    figures = [run.path / "eval" / "ape.json", run.path / "inspection.json"]
+    for path in figures:
+        files.write_sealed(path, {"rmse": 0.01})
+    assert run.damaged_figures() == [] and pipeline.notes(pipeline.states()) == []
+    flip(figures[0], bit=13)
+    assert run.damaged_figures() == ["eval/ape.json"]
+    assert any("eval/ape.json is damaged" in note for note in pipeline.notes(pipeline.states()))
+    with pytest.raises(Damaged, match=r"eval/ape\.json: it is damaged"):
+        housekeeping.archive(run, run.path.parent / "run.zip")
+    repaired(pipeline)
+    assert [path.exists() for path in figures] == [False, True]
+    assert "eval/ape.json was damaged, and is removed" in caplog.text
+
+
+def test_a_record_is_read_only_where_a_result_rests_on_it(pipeline: Pipeline, caplog: pytest.LogCaptureFixture) -> None:
+    flip(pipeline.run.path / "octree" / "stage.json")
+    RunDir(pipeline.run.path).stage_path("densify")
+    assert caplog.text == ""
+    RunDir(pipeline.run.path).stage_path("grid2d")
+    assert "grid2d is stale (input: octree is damaged)" in caplog.text
+
+
 def test_a_foreign_folder_is_not_restored(tmp_path: Path) -> None:
     (tmp_path / "run.json").write_text("{}")
     (tmp_path / "config.toml").write_text("mine = true")
+    (tmp_path / "eval").mkdir()
+    (tmp_path / "eval" / "mine.json").write_text("[]")
     RunDir(tmp_path).restore()
     assert (tmp_path / "config.toml").read_text() == "mine = true"
-    assert sorted(os.listdir(tmp_path)) == ["config.toml", "run.json"]
+    assert (tmp_path / "eval" / "mine.json").read_text() == "[]"
+    assert sorted(os.listdir(tmp_path)) == ["config.toml", "eval", "run.json"]
 
 
 def test_a_stage_and_an_export_refuse_an_altered_input(pipeline: Pipeline) -> None:
