@@ -262,12 +262,20 @@ def _parse_json(path: Path, text: str) -> dict[str, Any]:
 
 def sha256(path: Path) -> str:
     """Digest a file's content. A file that this process has digested before and that nobody has written to since is not read again."""
-    with open_regular(path) as file:
-        found = os.fstat(file.fileno())
-        key = (found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns, found.st_ctime_ns)
-        if key not in _known:
-            _known[key] = hashlib.file_digest(file, "sha256").hexdigest()
-    return _known[key]
+    known = _known.get(version(path))
+    if known is None:
+        with open_regular(path) as file:
+            known = _known[version(file.fileno())] = hashlib.file_digest(file, "sha256").hexdigest()
+    return known
+
+
+def version(path: str | Path | int) -> tuple[int, ...]:
+    """Return what changes when somebody writes to a file or replaces it; nothing where it is not there."""
+    try:
+        found = os.stat(path)
+    except FileNotFoundError:
+        return ()
+    return found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns, found.st_ctime_ns
 
 
 def digest(value: Any) -> str:

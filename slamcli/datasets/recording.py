@@ -93,7 +93,11 @@ class Recording:
         return self.read_ground_truth()
 
     def digest(self) -> str:
-        """Identify the recording by calibration and each frame's stamps, names and sizes; contents are not read."""
+        """Identify the recording by calibration and each frame's stamps, names and sizes, as first asked; contents are not read."""
+        return self._digest
+
+    @cached_property
+    def _digest(self) -> str:
         frames = [
             [repr(float(stamp)), repr(float(depth_stamp)), *names, self.colour.n_bytes(row), self._depth_bytes(depth_row)]
             for stamp, depth_stamp, *names, row, depth_row in zip(

@@ -151,9 +151,9 @@ class Pipeline:
             self._opened = self.run.dataset(self.config)
         return self._opened
 
-    def states(self, *, verify: bool = False) -> dict[str, State]:
-        """Judge every stage, looking at the recording and at the files that options name as they are now."""
-        return self.run.states(self.config, verify=verify, input_digest=self._input_digest)
+    def states(self, *, verify: bool = False, until: str | None = None) -> dict[str, State]:
+        """Judge every stage, or those that `until` rests on, looking at the recording and at the files that options name as they are now."""
+        return self.run.states(self.config, verify=verify, until=until, input_digest=self._input_digest)
 
     def _input_digest(self, name: str) -> str | None:
         """Digest the recording or a file an option names; None where it is not there, so that what was made from it still stands."""
@@ -191,7 +191,7 @@ class Pipeline:
             raise SlamError(f"--from {start} --until {until}: {until} comes before {start}")
         self._tell(f"{self.run.info()['dataset']} -> {self.run.path}")
         for index, stage in enumerate(STAGES[: last + 1]):
-            state = self.states(verify=True)[stage.name]
+            state = self.states(verify=True, until=stage.name)[stage.name]
             if state.is_fresh and index < first_forced:
                 self._tell(f"{stage.name:<9}  {state.state}")
                 continue
@@ -255,7 +255,8 @@ class Pipeline:
         if name in NAMES:
             return str((self.run.record(name) or {})["digest"])
         if name == "dataset":
-            return self.dataset().digest()
+            self._dataset_digest = self._dataset_digest or self.dataset().digest()
+            return self._dataset_digest
         digest = self._input_digest(name)
         if digest is None:
             section, _, option = name.partition(".")

@@ -43,6 +43,7 @@ class RunDir:
     def __init__(self, path: Path) -> None:
         self.path = Path(path)
         self._warned: set[str] = set()
+        self._judged: dict[str, tuple] = {}  # stages that were found fresh or warned of, with the versions of what says so
 
     # which run
 
@@ -258,7 +259,12 @@ class RunDir:
 
     def _warn_unless_fresh(self, stage: str) -> None:
         """Say once that a result is not what the run's configuration would give now."""
-        if stage in self._warned or (state := self.states(until=stage)[stage]).is_fresh or self.is_cleaned(state):
+        seen = tuple(files.version(self.path / name) for name in ("config.toml", f"{stage}/stage.json"))
+        if self._judged.get(stage) == seen:
+            return
+        self._judged[stage] = seen
+        state = self.states(until=stage)[stage]
+        if stage in self._warned or state.is_fresh or self.is_cleaned(state):
             return
         if state.reason not in self._warned:  # of several stages that are stale for one reason, one tells it
             log.warning(
@@ -298,9 +304,8 @@ class RunDir:
         config = config or self.config()
         states: dict[str, State] = {}
         for stage in STAGES if until is None else [stage for stage in STAGES if stage.name in basis(until)]:
-            found = self.damage(stage.name, verify=verify)
-            record = None if found else self.record(stage.name)
-            sources = source_code.of_stage(stage.name, (record or {}).get("reader", ""))
+            record, found = self._looked_at(stage.name, verify=verify)
+            sources = {} if record is None else source_code.of_stage(stage.name, record.get("reader", ""))
             states[stage.name] = staleness.assess(stage, config, record, found, states, input_digest, sources)
         return states
 
@@ -319,13 +324,18 @@ class RunDir:
 
     def damage(self, stage: str, *, verify: bool = False) -> str:
         """Say what is wrong with a stage's files, or "": each has its recorded size and, with `verify`, its recorded digest."""
+        return self._looked_at(stage, verify=verify)[1]
+
+    def _looked_at(self, stage: str, *, verify: bool) -> tuple[dict[str, Any] | None, str]:
+        """Return a stage's record and what is wrong with its files, or ""; None before it was run, and where anything is wrong."""
         try:
             record = self.record(stage)
         except SlamError as error:
-            return str(error).removeprefix(f"{self.path}/").partition("; repair")[0]
+            return None, str(error).removeprefix(f"{self.path}/").partition("; repair")[0]
         if record is None or record["format"] != FORMAT:
-            return ""
-        return damage.find(self.path / stage, record["outputs"], record["outputs"], verify=verify)
+            return record, ""
+        found = damage.find(self.path / stage, record["outputs"], record["outputs"], verify=verify)
+        return (None, found) if found else (record, "")
 
     # writing
 

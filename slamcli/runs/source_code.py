@@ -6,6 +6,7 @@ and nothing is parsed as a whole: `slamcli status` asks this each time.
 
 import functools
 import hashlib
+import os
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -17,6 +18,7 @@ DIGITS = 12  # hexadecimal, of a file's digest: chance equality of two states of
 SHOWN = 3  # changed files that a reason names
 READING = "datasets/__init__.py"  # through it the pipeline opens the recording for a stage that needs one
 JOINING = ["datasets/joined.py", "stages/joining.py"]  # of several recordings
+DATA = "data/"  # what code names and reads; data within folders of it are named by none
 READERS = "datasets/readers/"  # loaded by name, one for each layout
 
 # Reached by imports, yet without influence on what a stage computes from its inputs.
@@ -48,7 +50,7 @@ def of_stage(name: str, reader: str = "") -> Mapping[str, str]:
     """
     start = [f"stages/{name}.py"]
     if "dataset" in stage_named(name).needs:
-        start += [READING] + [file for file in (f"{READERS}{one}.py" for one in reader.split("+")) if _is_file(file)]
+        start += [READING] + [file for file in (f"{READERS}{one}.py" for one in reader.split("+")) if file in _files()]
     if reader.startswith("joined+"):
         start += JOINING
     return {file: _digest(file) for file in sorted(reachable(start))}
@@ -88,7 +90,7 @@ def reachable(start: list[str]) -> set[str]:
 @functools.cache
 def imported(file: str) -> frozenset[str]:
     """List the files of this package that a file imports; what only type checkers see is left out."""
-    return frozenset(path for module in _modules(_text(file)) for path in _files_of(module))
+    return frozenset(path for module in _modules(_content(file).decode()) for path in _files_of(module))
 
 
 def _modules(text: str) -> Iterator[str]:
@@ -107,25 +109,31 @@ def _files_of(module: str) -> tuple[str, ...]:
     """Return the file of a module, after those of the packages it lies in; what is no module gives those alone."""
     parts = module.split(".")[1:]
     packages = ["/".join([*parts[:k], "__init__.py"]) for k in range(len(parts) + 1)]
-    return tuple(file for file in [*packages, "/".join(parts) + ".py"] if _is_file(file))
+    return tuple(file for file in [*packages, "/".join(parts) + ".py"] if file in _files())
 
 
 @functools.cache
-def _is_file(file: str) -> bool:
-    return (PACKAGE / file).is_file()
+def _files() -> frozenset[str]:
+    """List the package's files; one walk is cheaper than asking for each name that an import may mean."""
+    found = ((os.path.relpath(folder, PACKAGE), names) for folder, _, names in os.walk(PACKAGE))
+    return frozenset(name if folder == "." else f"{folder}/{name}".replace(os.sep, "/") for folder, names in found for name in names)
 
 
 @functools.cache
-def _text(file: str) -> str:
-    return (PACKAGE / file).read_text(encoding="utf-8")
+def _content(file: str) -> bytes:
+    return (PACKAGE / file).read_bytes()
 
 
 @functools.cache
 def _data_named_in(file: str) -> tuple[str, ...]:
-    names = sorted(path.name for path in (PACKAGE / "data").glob("*") if path.is_file() and path.name in _text(file))
-    return tuple(f"data/{name}" for name in names)
+    return tuple(data for data in _data() if data.removeprefix(DATA).encode() in _content(file))
+
+
+@functools.cache
+def _data() -> tuple[str, ...]:
+    return tuple(sorted(file for file in _files() if file.startswith(DATA)))
 
 
 @functools.cache
 def _digest(file: str) -> str:
-    return hashlib.sha256((PACKAGE / file).read_bytes()).hexdigest()[:DIGITS]
+    return hashlib.sha256(_content(file)).hexdigest()[:DIGITS]
