@@ -35,9 +35,9 @@ class RunConfig:
 class RecordingConfig:
     """Which part of the recording is used, and what stands in for what it lacks. No stage declares it: it changes the recording."""
 
-    start: float = option(0.0, "time after the first frame at which to begin [s]", ge=0)
-    end: float = option(0.0, "time after the first frame at which to stop; 0 = never [s]", ge=0)
-    every: int = option(1, "use every n-th frame", ge=1)
+    start: float = option(0.0, "time after the first frame at which to begin [s]", ge=0, le=1_000_000)
+    end: float = option(0.0, "time after the first frame at which to stop; 0 = never [s]", ge=0, le=1_000_000)
+    every: int = option(1, "use every n-th frame", ge=1, le=100_000)
     fps: float = option(0.0, "frame rate of a recording without stamps; 0 = 30 [Hz]", ge=0, le=1000)
     known_camera: str = option("", 'known camera whose nominal intrinsics are used, such as "d435"; "" = the recording\'s own')
     find_depth_camera: bool = option(True, "where depth is plainly not registered, find its camera and register it")
@@ -49,13 +49,13 @@ class RecordingConfig:
 class SensorConfig:
     """The depth camera's noise and reach: what a measurement is worth, to every stage from track on."""
 
-    reading_noise_base: float = option(0.0012, "sigma of one depth reading at 0.4 m, the sensor's alone [m]", gt=0)
-    reading_noise_quadratic: float = option(0.0019, "growth of a reading's sigma with (z - 0.4 m)^2 [1/m]", ge=0)
-    depth_noise_base: float = option(0.008, "depth sigma at 0.4 m, with the errors of calibration and poses [m]", gt=0)
-    depth_noise_quadratic: float = option(0.008, "growth of the depth sigma with (z - 0.4 m)^2 [1/m]", ge=0)
-    pixel_noise: float = option(1.0, "sigma of a key point at octave 0 [px]; grows with the octave's scale", gt=0)
-    depth_min: float = option(0.3, "nearer readings are ignored [m]", ge=0)
-    depth_max: float = option(8.0, "farther readings are ignored; a new value moves the ranges of later stages along [m]", gt=0)
+    reading_noise_base: float = option(0.0012, "sigma of one depth reading at 0.4 m, the sensor's alone [m]", ge=1e-6, le=1)
+    reading_noise_quadratic: float = option(0.0019, "growth of a reading's sigma with (z - 0.4 m)^2 [1/m]", ge=0, le=1)
+    depth_noise_base: float = option(0.008, "depth sigma at 0.4 m, with the errors of calibration and poses [m]", ge=1e-6, le=1)
+    depth_noise_quadratic: float = option(0.008, "growth of the depth sigma with (z - 0.4 m)^2 [1/m]", ge=0, le=1)
+    pixel_noise: float = option(1.0, "sigma of a key point at octave 0 [px]; grows with the octave's scale", ge=0.01, le=100)
+    depth_min: float = option(0.3, "nearer readings are ignored [m]", ge=0, le=100)
+    depth_max: float = option(8.0, "farther readings are ignored; a new value moves the ranges of later stages along [m]", ge=0.01, le=100)
 
 
 @dataclass(frozen=True)
@@ -144,36 +144,36 @@ class MatchConfig:
     max_distance: int = option(64, "descriptors farther apart are no match [bits]", ge=0, le=256)
     ratio: float = option(0.8, "the nearest must be closer than this share of the second nearest's distance", gt=0, le=1)
     check_rotation: bool = option(True, "keep only matches whose rotation agrees with that of most others")
-    flow_below: int = option(100, "with fewer matches, those of optical flow are added, if extract.flow is on", ge=0)
-    flow_radius: float = option(2.0, "distance from a key point within which its partner's flow must end [px]", gt=0)
+    flow_below: int = option(100, "with fewer matches, those of optical flow are added, if extract.flow is on", ge=0, le=100_000)
+    flow_radius: float = option(2.0, "distance from a key point within which its partner's flow must end [px]", ge=0.01, le=1000)
 
 
 @dataclass(frozen=True)
 class TrackConfig:
     """Tracking and the windowed bundle adjustment."""
 
-    min_inliers: int = option(15, "fewer inliers: the frame is lost", ge=4)
-    start_features: int = option(100, "features with depth that the first key frame needs", ge=4)
-    ransac_rounds: int = option(100, "P3P samples drawn per frame; M of [Z] 1.2", ge=1, le=100000)
-    ransac_threshold_px: float = option(4.0, "reprojection error of an inlier to P3P [px]; [Z] 1.2", gt=0)
-    search_radius_px: float = option(5.0, "window of the local map's search at octave 0 [px]", gt=0)
+    min_inliers: int = option(15, "fewer inliers: the frame is lost", ge=4, le=20_000)
+    start_features: int = option(100, "features with depth that the first key frame needs", ge=4, le=20_000)
+    ransac_rounds: int = option(100, "P3P samples drawn per frame; M of [Z] 1.2", ge=1, le=100_000)
+    ransac_threshold_px: float = option(4.0, "reprojection error of an inlier to P3P [px]; [Z] 1.2", ge=0.01, le=1000)
+    search_radius_px: float = option(5.0, "window of the local map's search at octave 0 [px]", ge=0.01, le=1000)
     search_max_distance: int = option(80, "descriptors that differ more do not match [bits]", ge=1, le=256)
     search_ratio: float = option(0.8, "best against second best distance of the same octave", gt=0, le=1)
-    local_key_frames: int = option(20, "key frames whose landmarks are looked for in a frame", ge=1)
-    relocalize_candidates: int = option(5, "key frames tried after loss, best word score first", ge=1)
-    relocalize_inliers: int = option(45, "landmarks that must agree to recognize a place after loss; as for a closure", ge=4)
-    segment_after: int = option(10, "frames lost in a row at which a new map segment begins; 0 = never", ge=0)
+    local_key_frames: int = option(20, "key frames whose landmarks are looked for in a frame", ge=1, le=1000)
+    relocalize_candidates: int = option(5, "key frames tried after loss, best word score first", ge=1, le=1000)
+    relocalize_inliers: int = option(45, "landmarks that must agree to recognize a place after loss; as for a closure", ge=4, le=20_000)
+    segment_after: int = option(10, "frames lost in a row at which a new map segment begins; 0 = never", ge=0, le=1_000_000)
     key_frame_share: float = option(0.6, "a frame that holds less of its reference key frame's landmarks becomes one", gt=0, le=1)
-    key_frame_gap: int = option(8, "frames between key frames at most", ge=1)
-    key_frame_crowd: int = option(12, "no key frame where this many stand within 0.1 m and 6 degrees already", ge=1)
-    depth_icp_below: int = option(150, "with fewer landmarks, a frame is aligned by its depth image; 0 = without any", ge=0)
+    key_frame_gap: int = option(8, "frames between key frames at most", ge=1, le=1_000_000)
+    key_frame_crowd: int = option(12, "no key frame where this many stand within 0.1 m and 6 degrees already", ge=1, le=1_000_000)
+    depth_icp_below: int = option(150, "with fewer landmarks, a frame is aligned by its depth image; 0 = without any", ge=0, le=100_000)
     depth_icp_hold: float = option(1.0, "how long motion continues in directions that depth leaves open, as along a wall [s]", ge=0, le=10)
     moving_objects: bool = option(True, "find what moves, such as people; poses and maps rest on what stands still")
     rests: bool = option(True, "find where the camera stands still: one pose, no key frames")
-    share_key_frames: int = option(10, "neighbours in which a new key frame's landmarks are looked for", ge=0)
+    share_key_frames: int = option(10, "neighbours in which a new key frame's landmarks are looked for", ge=0, le=1000)
     share_max_distance: int = option(50, "descriptors that differ more are not one landmark [bits]", ge=1, le=256)
-    window_key_frames: int = option(12, "key frames adjusted with each new one", ge=2)
-    window_iterations: int = option(5, "rounds of the windowed bundle adjustment", ge=1)
+    window_key_frames: int = option(12, "key frames adjusted with each new one", ge=2, le=200)
+    window_iterations: int = option(5, "rounds of the windowed bundle adjustment", ge=1, le=1000)
 
 
 @dataclass(frozen=True)
@@ -181,7 +181,7 @@ class OptimizeConfig:
     """Global bundle adjustment."""
 
     enabled: bool = option(True, "false: the map passes through")
-    iterations: int = option(30, "rounds of global bundle adjustment at most", ge=1)
+    iterations: int = option(30, "rounds of global bundle adjustment at most", ge=1, le=1000)
     depth_icp_edges: int = option(
         3,
         "earlier key frames that each key frame's depth image is aligned with; 0 = none",
@@ -203,11 +203,11 @@ class OptimizeConfig:
         "find the offset of inverse depth, as of a constant error of disparity",
     )
     rounds: int = option(2, "rounds of adjusting the map and finding those numbers", ge=1, le=10)
-    timing_prior: float = option(0.02, "standard deviation of readout times and delay around 0 [s]", gt=0, le=1)
-    focal_prior: float = option(0.02, "standard deviation of the calibration's focal lengths, as a share of them", gt=0, le=1)
-    centre_prior: float = option(5.0, "standard deviation of the calibration's principal point [px]", gt=0, le=1000)
-    depth_scale_prior: float = option(0.02, "standard deviation of the depth scale, as a share of it", gt=0, le=1)
-    inverse_depth_prior: float = option(0.02, "standard deviation of the offset of inverse depth [1/m]", gt=0, le=1)
+    timing_prior: float = option(0.02, "standard deviation of readout times and delay around 0 [s]", ge=1e-6, le=1)
+    focal_prior: float = option(0.02, "standard deviation of the calibration's focal lengths, as a share of them", ge=1e-6, le=1)
+    centre_prior: float = option(5.0, "standard deviation of the calibration's principal point [px]", ge=1e-3, le=1000)
+    depth_scale_prior: float = option(0.02, "standard deviation of the depth scale, as a share of it", ge=1e-6, le=1)
+    inverse_depth_prior: float = option(0.02, "standard deviation of the offset of inverse depth [1/m]", ge=1e-6, le=1)
 
 
 @dataclass(frozen=True)
@@ -215,25 +215,25 @@ class LoopConfig:
     """Loop closing."""
 
     enabled: bool = option(True, "false: the map passes through")
-    rounds: int = option(3, "passes of search, correction and adjustment at most; the next begins only after new closures", ge=1)
-    candidates: int = option(3, "key frames looked at per key frame, best word score first", ge=1)
+    rounds: int = option(3, "passes of search, correction and adjustment at most; the next begins only after new closures", ge=1, le=100)
+    candidates: int = option(3, "key frames looked at per key frame, best word score first", ge=1, le=1000)
     min_score: float = option(0.32, "similarity of word vectors that always makes a candidate; [Z] 1.3", ge=0, le=1)
     score_share: float = option(0.6, "share of the mean score of a key frame's neighbours that makes a candidate", ge=0, le=1)
-    near: float = option(0.7, "key frames that look at spots this near are candidates; 0 = off [m]", ge=0)
-    min_shared: int = option(15, "key frames that share this many landmarks are joined already", ge=1)
-    min_matches: int = option(20, "matches under the same words that a candidate needs", ge=4)
-    min_inliers: int = option(45, "landmarks found again that an accepted closure needs; [Z] 1.3", ge=6)
-    ransac_rounds: int = option(300, "3-D to 3-D samples per candidate", ge=1)
-    ransac_threshold_px: float = option(6.0, "reprojection error of an inlier, both ways [px]", gt=0)
-    search_radius_px: float = option(4.0, "window for the landmarks around a candidate at octave 0 [px]", gt=0)
-    neighbours: int = option(10, "covisible key frames whose landmarks take part in verification and fusion", ge=0)
+    near: float = option(0.7, "key frames that look at spots this near are candidates; 0 = off [m]", ge=0, le=1000)
+    min_shared: int = option(15, "key frames that share this many landmarks are joined already", ge=1, le=20_000)
+    min_matches: int = option(20, "matches under the same words that a candidate needs", ge=4, le=20_000)
+    min_inliers: int = option(45, "landmarks found again that an accepted closure needs; [Z] 1.3", ge=6, le=20_000)
+    ransac_rounds: int = option(300, "3-D to 3-D samples per candidate", ge=1, le=100_000)
+    ransac_threshold_px: float = option(6.0, "reprojection error of an inlier, both ways [px]", ge=0.01, le=1000)
+    search_radius_px: float = option(4.0, "window for the landmarks around a candidate at octave 0 [px]", ge=0.01, le=1000)
+    neighbours: int = option(10, "covisible key frames whose landmarks take part in verification and fusion", ge=0, le=1000)
     fuse_max_distance: int = option(50, "descriptors that differ more are not one landmark [bits]", ge=1, le=256)
-    edge_shared: int = option(30, "shared landmarks that make an edge of the pose graph", ge=1)
-    edges_per_key_frame: int = option(10, "edges of the pose graph per key frame at most, closures and neighbours aside", ge=1)
-    closure_spacing: int = option(10, "no second closure is sought within this many key frames of one", ge=0)
-    iterations: int = option(20, "rounds of each global bundle adjustment at most", ge=1)
-    join_closures: int = option(2, "closures that must agree on how two map segments lie before these are joined", ge=1)
-    main_segment: int = option(0, "map segment that the maps are made of; 0 = the largest", ge=0)
+    edge_shared: int = option(30, "shared landmarks that make an edge of the pose graph", ge=1, le=20_000)
+    edges_per_key_frame: int = option(10, "edges of the pose graph per key frame at most, closures and neighbours aside", ge=1, le=1000)
+    closure_spacing: int = option(10, "no second closure is sought within this many key frames of one", ge=0, le=1_000_000)
+    iterations: int = option(20, "rounds of each global bundle adjustment at most", ge=1, le=1000)
+    join_closures: int = option(2, "closures that must agree on how two map segments lie before these are joined", ge=1, le=1000)
+    main_segment: int = option(0, "map segment that the maps are made of; 0 = the largest", ge=0, le=1_000_000)
     final_refinement: bool = option(True, "once loops are closed, match every frame again against the final map")
     depth_icp_edges: int = option(
         6,
@@ -241,12 +241,7 @@ class LoopConfig:
         ge=0,
         le=50,
     )
-    depth_icp_weight: float = option(
-        2.0,
-        "weight of those alignments in the last adjustment; in optimize it is 1",
-        gt=0,
-        le=100,
-    )
+    depth_icp_weight: float = option(2.0, "weight of those alignments in the last adjustment; in optimize it is 1", ge=1e-3, le=100)
 
 
 @dataclass(frozen=True)
@@ -263,13 +258,15 @@ class DensifyConfig(SurfaceConfig):
     """The coloured cloud."""
 
     method: str = option("voxel", "voxel averages, or a surface by Open3D (slower; mesh.ply too)", choices=("voxel", "tsdf"))
-    voxel: float = option(0.01, "voxel side of the cloud [m]", gt=0, le=1)
+    voxel: float = option(0.01, "voxel side of the cloud [m]", ge=1e-3, le=1)
     stride: int = option(2, "every stride-th row and column of a depth image is used", ge=1, le=64)
-    depth_max: float = option(4.0, "farther readings are ignored [m]", gt=0, le=100)
+    depth_max: float = option(4.0, "farther readings are ignored [m]", ge=0.01, le=100)
     even_colours: bool = option(False, "even out exposure, white balance and vignetting of key frames; reads images twice")
-    min_points: int = option(1, "voxels with fewer readings are dropped", ge=1)
+    min_points: int = option(1, "voxels with fewer readings are dropped", ge=1, le=1_000_000)
     neighbours: int = option(6, "stray points are found by their mean distance to this many neighbours; 0 keeps all", ge=0, le=100)
-    max_deviation: float = option(2.0, "points whose mean distance is this many standard deviations above average are dropped", gt=0)
+    max_deviation: float = option(
+        2.0, "points whose mean distance is this many standard deviations above average are dropped", ge=0.01, le=1000
+    )
 
 
 @dataclass(frozen=True)
@@ -278,15 +275,15 @@ class GroundConfig:
 
     method: str = option("robust", "lowest horizontal plane, or the paper's frequent gradients and RANSAC", choices=("robust", "paper"))
     stride: int = option(8, "side of the blocks of pixels that are averaged to one point [px]", ge=1, le=64)
-    max_range: float = option(5.0, "farther readings are ignored [m]", gt=0, le=100)
-    distance: float = option(0.02, "inliers lie within this of the plane, twice the depth noise added [m]", gt=0, le=1)
+    max_range: float = option(5.0, "farther readings are ignored [m]", ge=0.01, le=100)
+    distance: float = option(0.02, "inliers lie within this of the plane, twice the depth noise added [m]", ge=1e-4, le=1)
     min_cosine: float = option(0.94, "cosine of the tilt up to which a surface counts as horizontal", gt=0, lt=1)
-    min_patches: int = option(50, "a floor has at least this many blocks in all key frames", ge=3)
+    min_patches: int = option(50, "a floor has at least this many blocks in all key frames", ge=3, le=1_000_000)
     min_share: float = option(0.01, "a floor has at least this share of the upward-facing blocks", ge=0, le=1)
-    max_below: float = option(0.05, "a floor has at most this share of its blocks below it", ge=0)
-    min_height: float = option(0.05, "the camera is at least this high above the floor [m]", ge=0)
+    max_below: float = option(0.05, "a floor has at most this share of its blocks below it", ge=0, le=1)
+    min_height: float = option(0.05, "the camera is at least this high above the floor [m]", ge=0, le=100)
     middle: float = option(0.6, "paper: share of the image's width and height taken around its middle", gt=0, le=1)
-    gradient_bin: float = option(0.01, "paper: bin side of the gradient histogram [m]", gt=0, le=1)
+    gradient_bin: float = option(0.01, "paper: bin side of the gradient histogram [m]", ge=1e-3, le=1)
     rounds: int = option(200, "paper: RANSAC rounds", ge=1, le=100000)
 
 
@@ -294,14 +291,14 @@ class GroundConfig:
 class OctreeConfig(SurfaceConfig):
     """The occupancy octree."""
 
-    resolution: float = option(0.05, "leaf side [m]", gt=0, le=10)
+    resolution: float = option(0.05, "leaf side [m]", ge=1e-3, le=10)
     frames: str = option(
         "auto",
         "frames inserted: key frames, all, or key frames and those where something vanished",
         choices=("auto", "key", "all"),
     )
     stride: int = option(4, "every stride-th row and column of a depth image is used", ge=1, le=64)
-    max_range: float = option(3.2, "rays are cut off here: a Kinect's noise reaches a third of a cell [m]", gt=0, le=1000)
+    max_range: float = option(3.2, "rays are cut off here: a Kinect's noise reaches a third of a cell [m]", ge=0.01, le=1000)
     hit: float = option(0.7, "probability of a cell in which a ray ends", gt=0.5, lt=1)
     miss: float = option(0.4, "probability of a cell that a ray passes", gt=0, lt=0.5)
     clamp_min: float = option(0.1192, "least probability of a cell", gt=0, lt=0.5)
@@ -313,23 +310,23 @@ class OctreeConfig(SurfaceConfig):
 class GridConfig:
     """The 2-D grid."""
 
-    resolution: float = option(0.05, "cell side [m]", gt=0, le=10)
+    resolution: float = option(0.05, "cell side [m]", ge=1e-3, le=10)
     source: str = option("points", "what the grid is made from: the key frames' depth, or the octree", choices=("points", "octree"))
     band_low: float = option(0.05, "the robot drives over what is lower [m]", ge=0, le=10)
     max_slope: float = option(8.0, "ramps that are no steeper are floor; 0 = level floor only [degrees]", ge=0, le=45)
-    band_high: float = option(0.5, "the robot's height: what is higher is passable [m]", gt=0, le=100)
-    drop: float = option(0.08, "an edge: a cell through whose floor something this much deeper was seen [m]", gt=0, le=10)
-    spacing: float = option(0.12, "a frame is used when the camera has moved this far since the last [m]", gt=0)
+    band_high: float = option(0.5, "the robot's height: what is higher is passable [m]", ge=1e-3, le=100)
+    drop: float = option(0.08, "an edge: a cell through whose floor something this much deeper was seen [m]", ge=1e-3, le=10)
+    spacing: float = option(0.12, "a frame is used when the camera has moved this far since the last [m]", ge=1e-4, le=100)
     spacing_deg: float = option(12.0, "a frame is used when the camera has turned this far since the last [degrees]", gt=0, le=180)
     stride: int = option(2, "every stride-th row and column of a depth image is used", ge=1, le=64)
-    min_range: float = option(0.3, "nearer readings are ignored [m]", ge=0)
-    max_range: float = option(4.0, "farther readings are ignored [m]", gt=0, le=100)
+    min_range: float = option(0.3, "nearer readings are ignored [m]", ge=0, le=100)
+    max_range: float = option(4.0, "farther readings are ignored [m]", ge=0.01, le=100)
     extend_down: bool = option(True, "an upright surface that leaves the picture downwards is taken to reach the floor")
     own_body: bool = option(True, "leave out what shows the same near depth in every view: the robot's body")
     mask: str = option("", "picture of depth's size; where it is not black, depth is left out", is_file=True)
     driven: float = option(0.0, "floor this near the camera's path is free, on a robot; 0 = off [m]", ge=0, le=5)
-    n_low: int = option(4, "n_l of (20): a cell with fewer points in a view is empty", ge=1)
-    n_high: int = option(12, "n_h of (20): a cell with more points in a view is occupied", ge=1)
+    n_low: int = option(4, "n_l of (20): a cell with fewer points in a view is empty", ge=1, le=1_000_000)
+    n_high: int = option(12, "n_h of (20): a cell with more points in a view is occupied", ge=1, le=1_000_000)
     update: str = option("evidence", "how views add up: log-odds, or (22), (23) as printed", choices=("evidence", "paper"))
     p_empty_empty: float = option(0.9, "P(E1|E2) of (22)", gt=0, lt=1)
     p_full_empty: float = option(0.1, "P(F1|E2) of (22)", gt=0, lt=1)

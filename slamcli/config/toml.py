@@ -91,7 +91,8 @@ def apply(base: Config, assignments: Iterable[str]) -> Config:
         values: Any = _parse(text)
         for part in reversed(key.split(".", 1)):
             values = {part: values}
-        base = merge(base, values, source=f"-s {assignment}")
+        shown = assignment if len(assignment) <= LONGEST_SHOWN else f"{assignment[:LONGEST_SHOWN]}..."
+        base = merge(base, values, source=f"-s {shown}")
     return base
 
 
@@ -180,11 +181,10 @@ def _value(section: type, section_name: str, key: str, value: Any, source: str) 
     if spec is None or _is_section(spec):
         raise _unknown(name, source)
     origin, meta = _origin(name, value, source), spec.metadata
-    value = _typed(_hints(section)[key], value, origin)
-    for bound, limit in meta["bounds"].items():
-        sign, holds = COMPARISONS[bound]
-        if not holds(value, limit):
-            raise SlamError(f"{origin}: must be {sign} {limit} ({meta['help']})")
+    allowed = _range(meta["bounds"])
+    value = _typed(_hints(section)[key], value, origin, allowed)
+    if not all(COMPARISONS[bound][1](value, limit) for bound, limit in meta["bounds"].items()):
+        raise SlamError(f"{origin}: must be {allowed} ({meta['help']})")
     if meta["choices"] and value not in meta["choices"]:
         raise SlamError(f"{origin}: must be one of {', '.join(map(str, meta['choices']))} ({meta['help']})")
     if meta["is_file"] and value:
@@ -202,15 +202,21 @@ def _origin(name: str, value: Any, source: str) -> str:
     return f"{source}: {name} = {shown if len(shown) <= LONGEST_SHOWN else shown[:LONGEST_SHOWN] + '...'}"
 
 
-def _typed(expected: Any, value: Any, origin: str) -> Any:
+def _range(bounds: Mapping[str, Any]) -> str:
+    """Write an option's bounds as ">= 4, <= 20000"; "" without any."""
+    return ", ".join(f"{COMPARISONS[bound][0]} {limit}" for bound, limit in bounds.items())
+
+
+def _typed(expected: Any, value: Any, origin: str, allowed: str = "") -> Any:
     if get_origin(expected) is tuple:
         return _typed_tuple(get_args(expected), value, origin)
+    kind = ", ".join(filter(None, (KINDS[expected], allowed)))
     if isinstance(value, int) and abs(value) > LARGEST_NUMBER:
-        raise SlamError(f"{origin}: too large a number")
+        raise SlamError(f"{origin}: too large a number; must be {kind}")
     if expected is float and isinstance(value, int) and not isinstance(value, bool):
         value = float(value)
     if type(value) is not expected or (expected is float and not math.isfinite(value)):
-        raise SlamError(f"{origin}: must be {KINDS[expected]}")
+        raise SlamError(f"{origin}: must be {kind}")
     return value
 
 
@@ -319,7 +325,7 @@ class Told:
         """Write an option as TOML, with what is to be told of it in comments."""
         if self.explain:
             meta = spec.metadata
-            notes = [f"{COMPARISONS[bound][0]} {limit}" for bound, limit in meta["bounds"].items()]
+            notes = [_range(meta["bounds"])] if meta["bounds"] else []
             notes += [" | ".join(map(str, meta["choices"]))] if meta["choices"] else []
             notes += [
                 f"{preset}: {_toml(_get(config, name))}" for preset, config in self.presets.items() if _get(config, name) != spec.default

@@ -116,6 +116,8 @@ def _changed_inputs(
     for name in stage.needs:
         if name == "dataset":
             continue
+        if before[name].state == STALE and before[name].reason.endswith(f" is {DAMAGED}"):
+            return before[name].reason  # what is damaged, however far back, is worth more than what follows from it
         if not before[name].is_fresh:
             return f"input: {name} is {before[name].state}"
         if before[name].record["digest"] != recorded.get(name):

@@ -1,6 +1,7 @@
 """The configuration: one source for defaults, bounds and help; every mistake is named with the key and what would do."""
 
 import dataclasses
+import math
 import tomllib
 from pathlib import Path
 
@@ -73,19 +74,23 @@ def test_any_assignment_is_taken_or_refused_in_one_line(text: str) -> None:
         ("trck.min_inliers=20", "trck.min_inliers is not known; did you mean track.min_inliers?"),
         ("min_inliers=20", "min_inliers is not known; did you mean track.min_inliers or loop.min_inliers?"),
         ("qqq.zzz=1", "qqq.zzz is not known; see: slamcli config --explain"),
-        ("track.min_inliers=2", "must be >= 4 (fewer inliers: the frame is lost)"),
+        ("track.min_inliers=2", "must be >= 4, <= 20000 (fewer inliers: the frame is lost)"),
         ("track.min_inliers=4.5", "must be a whole number"),
         ("track.min_inliers=true", "must be a whole number"),
         ("track.min_inliers=many", "must be a whole number"),
         ("track.min_inliers=", "must be a whole number"),
         ("track.min_inliers=1\nseed=3", "must be a whole number"),
-        ("extract.scale=nan", "must be a number"),
-        ("extract.scale=inf", "must be a number"),
+        ("extract.scale=nan", "must be a number, > 1.0, <= 2.0"),
+        ("extract.scale=inf", "must be a number, > 1.0, <= 2.0"),
         ("extract.scale=1.0", "must be > 1.0"),
         ("loop.enabled=1", "must be true or false"),
         ("match.method=magic", "must be one of words, brute"),
         ("seed=-1", "must be >= 0"),
-        ("seed=99999999999999999999", "seed=99999999999999999999: too large a number"),
+        ("seed=99999999999999999999", "seed=99999999999999999999: too large a number; must be a whole number, >= 0"),
+        ("extract.features=1e9", "must be a whole number, >= 50, <= 20000"),
+        ("extract.features=1000000000", "must be >= 50, <= 20000 (key points"),
+        ("octree.resolution=1e-9", "must be >= 0.001, <= 10 (leaf side"),
+        ("octree.resolution=" + "9" * 5000, "9...: "),
         ("seed", "write -s section.key=value"),
         ("=1", "write -s section.key=value"),
         ("track=1", "track is a section"),
@@ -101,6 +106,50 @@ def test_a_wrong_assignment_names_the_key_and_what_would_do(assignment: str, mes
         toml.apply(Config(), [assignment])
     assert str(caught.value).startswith("-s ")
     assert message in str(caught.value)
+
+
+NUMBERS = {
+    name: spec
+    for name, spec in [*options(), *((spec.name, spec) for spec in dataclasses.fields(Config) if spec.name == "seed")]
+    if type(spec.default) in (int, float) and not spec.metadata["choices"]
+}
+HUGE = (
+    "1e9",
+    "-1e9",
+    "1e300",
+    "-1e300",
+    "1e-300",
+    "-1",
+    "1000000000",
+    "-1000000000",
+    "9" * 400,
+    "9" * 5000,
+    "nan",
+    "inf",
+    "-inf",
+    "0",
+    "0.0",
+    "-0.0",
+)
+
+
+@pytest.mark.parametrize("name", NUMBERS)
+def test_every_number_has_bounds_on_both_sides_and_what_lies_beyond_is_told_with_them(name: str) -> None:
+    """So that no value asks for more memory or time than there is: what lies within bounds, scripts/extremes.py tries."""
+    bounds = NUMBERS[name].metadata["bounds"]
+    assert {"ge", "gt"} & bounds.keys() and {"le", "lt"} & bounds.keys(), "an option without a lower or an upper bound"
+    assert all(math.isfinite(bound) for bound in bounds.values())
+    told = toml._range(bounds)
+    said = []
+    for text in HUGE:
+        try:
+            config = toml.apply(Config(), [f"{name}={text}"])
+        except SlamError as error:
+            said.append(str(error))
+        else:
+            assert toml.parse(toml.dump(config).encode(), source="written") == config  # also the ranges that follow from it
+    assert len(said) >= 8
+    assert all(told in line and len(line) < 400 and "\n" not in line for line in said)
 
 
 @pytest.mark.parametrize(
@@ -163,7 +212,7 @@ def test_lists_are_checked_item_by_item() -> None:
 
 def test_explain_shows_unit_and_bounds_of_what_is_asked() -> None:
     text = toml.dump(Config(), explain=True, only=["track.min_inliers", "sensor"])
-    assert "# fewer inliers: the frame is lost; >= 4\nmin_inliers = 15" in text
+    assert "# fewer inliers: the frame is lost; >= 4, <= 20000\nmin_inliers = 15" in text
     assert "[sensor]" in text
     assert "[extract]" not in text
     with pytest.raises(SlamError, match="did you mean"):

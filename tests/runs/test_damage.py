@@ -140,6 +140,9 @@ def test_a_record_is_read_only_where_a_result_rests_on_it(pipeline: Pipeline, ca
     assert caplog.text == ""
     RunDir(pipeline.run.path).stage_path("grid2d")
     assert "grid2d is stale (input: octree is damaged)" in caplog.text
+    flip(pipeline.run.path / "match" / "stage.json")
+    RunDir(pipeline.run.path).stage_path("densify")
+    assert "densify is stale (input: match is damaged)" in caplog.text
 
 
 def test_a_foreign_folder_is_not_restored(tmp_path: Path) -> None:
