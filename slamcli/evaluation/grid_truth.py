@@ -66,8 +66,9 @@ def _solid(about: dict[str, Any]) -> dict[str, Any]:
 
 
 def _numbers(values: Any, n: int) -> list[float]:
+    """Return a list of n numbers; ValueError or TypeError for anything else."""
     found = [float(value) for value in values]
-    if len(found) != n or not np.isfinite(found).all() or np.abs(found).max() > LARGEST:
+    if not isinstance(values, list) or len(found) != n or not np.isfinite(found).all() or np.abs(found).max() > LARGEST:
         raise ValueError(f"{n} finite numbers are expected")
     return found
 
