@@ -251,21 +251,18 @@ class Run:
 
         stage = stage or trajectory_error.last_stage(self.directory)
         truth = trajectory_error.ground_truth(self.directory)
-        return trajectory_error.ape(self.trajectory(stage), truth, n_frames=self._n_frames(), name=self.name, stage=stage)
+        return trajectory_error.ape(
+            self.trajectory(stage), truth, n_frames=trajectory_error.frame_count(self.directory), name=self.name, stage=stage
+        )
 
     def rpe(self, stage: str | None = None, *, seconds: float | None = 1.0) -> "Rpe":
         """Measure the relative pose error over an interval, or from one frame to the next where that is None."""
         from slamcli.evaluation import trajectory_error
-        from slamcli.schema import Features
+        from slamcli.schema import FrameTimes
 
         stage = stage or trajectory_error.last_stage(self.directory)
-        truth, stamp = trajectory_error.ground_truth(self.directory), self.directory.load(Features, "extract").stamp
+        truth, stamp = trajectory_error.ground_truth(self.directory), self.directory.load(FrameTimes, stage).stamp
         return trajectory_error.rpe(self.trajectory(stage), truth, frame_stamp=stamp, name=self.name, stage=stage, seconds=seconds)
-
-    def _n_frames(self) -> int:
-        from slamcli.schema import Features
-
-        return len(self.directory.load(Features, "extract").stamp)
 
     def verdict(self) -> "Verdict | None":
         """Judge whether a robot could use the map, and why not; None while there is no grid."""

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-FORMAT = 7  # of everything a run directory holds; raised whenever an array changes its meaning
+FORMAT = 8  # of everything a run directory holds; raised whenever an array changes its meaning
 
 
 def array(dtype: str, shape: str, meaning: str, *, may_lack: bool = False, narrow: str = "") -> Any:
@@ -40,6 +40,14 @@ class Features:
     angle: np.ndarray = array("f4", "M", "rad, of the intensity centroid")
     desc: np.ndarray = array("u1", "M 32", "ORB descriptor, 256 bits")
     octave_scale: np.ndarray = array("f8", "", "size ratio of neighbouring pyramid levels")
+
+
+@dataclass(frozen=True)
+class FrameTimes:
+    """When each frame's images were taken, by extract, and again by track, optimize and loop: their poses are read without features."""
+
+    stamp: np.ndarray = array("f8", "F", "s, of the colour image")
+    depth_stamp: np.ndarray = array("f8", "F", "s, of the depth image paired with it, NaN where there is none")
 
 
 @dataclass(frozen=True)
@@ -165,7 +173,7 @@ class Timing:
 
 @dataclass(frozen=True)
 class Recordings:
-    """Which frames are of which recording, by extract of a run of several, whose frames are numbered through."""
+    """Which frames are of which recording, by extract and loop of a run of several, whose frames are numbered through."""
 
     recording_offset: np.ndarray = array("i8", "D+1", "frames of a recording")
     own_stamp: np.ndarray = array("f8", "F", "s, of the colour image in its recording; stamps of Features are of one time line for all")

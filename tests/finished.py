@@ -14,7 +14,7 @@ from slamcli.formats.trajectory import write_tum
 from slamcli.geometry import se3
 from slamcli.runs import pipeline, source_code, staleness
 from slamcli.runs.run_directory import RunDir, outputs
-from slamcli.schema import FORMAT, Closures, Doubt, Features, Ground, Map, Moving, Timing, Tracks, Trajectory, trajectory
+from slamcli.schema import FORMAT, Closures, Doubt, Features, FrameTimes, Ground, Map, Moving, Timing, Tracks, Trajectory, trajectory
 from slamcli.stages import STAGES
 
 START = 1305031102.0  # [s]
@@ -117,6 +117,7 @@ def _results(rng: np.random.Generator, truth: Trajectory, lost: np.ndarray, n_do
     maps = {name: _map(T_wc[kf_frame], kf_frame) for name, T_wc in (("track", found["track"].T_wc), ("loop", found["loop"].T_wc))}
     when = Timing(readout=np.array(0.0), depth_readout=np.array(0.0), depth_delay=np.array(0.0), twist=np.zeros((frames, 6)))
     unknown, sure = np.full(frames, np.nan, np.float32), np.full(frames, 0.003, np.float32)
+    times = FrameTimes(stamp=truth.stamp, depth_stamp=truth.stamp)
     doubts = Doubt(
         contradicted=unknown,
         disagreement=unknown,
@@ -126,9 +127,9 @@ def _results(rng: np.random.Generator, truth: Trajectory, lost: np.ndarray, n_do
     )
     return {
         "extract": (features,),
-        "track": (track, Moving(), maps["track"]),
-        "optimize": (track, when, maps["track"]),
-        "loop": (loop, closures, when, Moving(), doubts, maps["loop"]),
+        "track": (track, times, Moving(), maps["track"]),
+        "optimize": (track, times, when, maps["track"]),
+        "loop": (loop, times, closures, when, Moving(), doubts, maps["loop"]),
         "densify": (ground,),
     }
 

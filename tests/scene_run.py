@@ -10,7 +10,7 @@ from slamcli.config.options import LoopConfig, OptimizeConfig, SensorConfig, Tra
 from slamcli.depth.coarse_images import encode
 from slamcli.files import read_json
 from slamcli.geometry.camera import Camera
-from slamcli.schema import CoarseDepth, Features, Map, Matches, Tracks, Words
+from slamcli.schema import CoarseDepth, Features, FrameTimes, Map, Matches, Tracks, Words
 
 SENSOR = SensorConfig(pixel_noise=0.5)
 
@@ -27,7 +27,9 @@ class Run:
         self.warn, self.summary = self.warnings.append, {}
 
     def load(self, cls, stage):
-        given = {Features: self.scene.features, Words: self.scene.words, Matches: self.scene.matches, CoarseDepth: self.depth}
+        features = self.scene.features
+        times = FrameTimes(features.stamp, features.depth_stamp)
+        given = {Features: features, FrameTimes: times, Words: self.scene.words, Matches: self.scene.matches, CoarseDepth: self.depth}
         return given[cls] if cls in given else artifacts.load(cls, self.folder / stage)
 
     def camera(self, stage="extract"):

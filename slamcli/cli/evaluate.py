@@ -206,9 +206,10 @@ def _without_sure(figures: dict[str, Any]) -> dict[str, Any]:
 
 
 def _frame_stamp(folder: RunDir) -> np.ndarray:
-    from slamcli.schema import Features
+    from slamcli.evaluation.trajectory_error import last_stage
+    from slamcli.schema import FrameTimes
 
-    return folder.load(Features, "extract").stamp
+    return folder.load(FrameTimes, last_stage(folder)).stamp
 
 
 def _trajectories(folder: RunDir, stage: str | None, other: tuple[str, ...]) -> list[tuple[str, str, Trajectory]]:

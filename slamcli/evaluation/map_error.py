@@ -14,7 +14,7 @@ from slamcli.formats import octomap
 from slamcli.geometry import se3
 from slamcli.navigation import grid
 from slamcli.runs.run_directory import RunDir
-from slamcli.schema import Features, Grid, Ground, Map, Moving, Tracks, frame_poses
+from slamcli.schema import FrameTimes, Grid, Ground, Map, Moving, Tracks, frame_poses
 from slamcli.stages.depth_frames import depth_poses
 from slamcli.stages.octree import scans
 
@@ -58,18 +58,18 @@ def _scene_file(run: RunDir) -> Path:
 
 def grid_score(run: RunDir, *, progress: Progress) -> dict[str, Any]:
     """Compare the grid with the scene: shares of cells right, and whether the special boxes are in it."""
-    dataset, camera, settings = run.dataset(), run.camera(), run.config().grid2d
+    dataset, camera, settings = run.dataset(), run.camera("loop"), run.config().grid2d
     scene, cells = grid_truth.read_scene(_scene_file(run)), run.load(Grid, "grid2d")
-    features, T_lw, truth = run.load(Features, "extract"), run.load(Ground, "densify").T_lw, trajectory_error.ground_truth(run)
-    aligned = trajectory_error.ape(trajectory_error.stage_trajectory(run, "loop"), truth, n_frames=len(features.stamp), name=str(run.path))
+    times, T_lw, truth = run.load(FrameTimes, "loop"), run.load(Ground, "densify").T_lw, trajectory_error.ground_truth(run)
+    aligned = trajectory_error.ape(trajectory_error.stage_trajectory(run, "loop"), truth, n_frames=len(times.stamp), name=str(run.path))
     T_sl = aligned.T_gw @ se3.inverse(T_lw)  # a simulated recording's truth is given in its scene's frame
     T_lc = T_lw @ frame_poses(run.load(Tracks, "loop"), run.load(Map, "loop"))
     frames = grid.spaced(T_lc, metres=settings.spacing, degrees=settings.spacing_deg)
-    frames = frames[np.isfinite(features.depth_stamp[frames])]
+    frames = frames[np.isfinite(times.depth_stamp[frames])]
 
     def points() -> Iterable[np.ndarray]:
         """Return what each frame that the grid is made from truly showed."""
-        for row, true_row in progress(associate(features.depth_stamp[frames], truth.stamp), "eval map"):
+        for row, true_row in progress(associate(times.depth_stamp[frames], truth.stamp), "eval map"):
             try:
                 depth = dataset.depth(int(frames[row]))
             except BadFrame:

@@ -8,10 +8,8 @@ import numpy as np
 from slamcli.errors import SlamError
 from slamcli.evaluation import trajectory_error
 from slamcli.evaluation.trajectory_error import Ape
-from slamcli.formats.trajectory import read_tum
 from slamcli.runs.run_directory import RunDir
-from slamcli.schema import Features, Map, Recordings, Tracks, Trajectory, frame_segments, trajectory
-from slamcli.stages.of_several import recording_file
+from slamcli.schema import FrameTimes, Map, Recordings, Tracks, Trajectory, frame_segments, trajectory
 
 
 def number_of(run: RunDir, name: str) -> int:
@@ -25,10 +23,7 @@ def number_of(run: RunDir, name: str) -> int:
 
 def part(run: RunDir, name: str, whole: Trajectory) -> Trajectory:
     """Return the poses of one recording out of a trajectory of its run, in the same frame, at the stamps that the recording itself has."""
-    number = number_of(run, name)
-    if run.record("extract") is None:
-        return read_tum(run.stage_path("loop", recording_file(name)))
-    stamp, recordings = run.load(Features, "extract").stamp, run.load(Recordings, "extract")
+    number, (stamp, recordings) = number_of(run, name), _recordings(run)
     frame = np.searchsorted(stamp, whole.stamp)
     first, last = recordings.recording_offset[number : number + 2]
     here = (frame >= first) & (frame < last)
@@ -38,9 +33,13 @@ def part(run: RunDir, name: str, whole: Trajectory) -> Trajectory:
 def frame_count(run: RunDir, name: str) -> int:
     """Return how many frames one recording of a run has."""
     number = number_of(run, name)
-    if run.record("extract") is None:
-        return int((run.record("loop") or {"summary": {}})["summary"]["recordings"][number]["frames"])
-    return int(np.diff(run.load(Recordings, "extract").recording_offset)[number])
+    return int(np.diff(_recordings(run)[1].recording_offset)[number])
+
+
+def _recordings(run: RunDir) -> tuple[np.ndarray, Recordings]:
+    """Return the stamp of each frame (F,) [s] and which recording it is of, as loop keeps them, or extract before loop was run."""
+    stage = "extract" if run.record("loop") is None else "loop"
+    return run.load(FrameTimes, stage).stamp, run.load(Recordings, stage)
 
 
 def apes(run: RunDir, whole: Ape, truth: Trajectory) -> list[Ape]:
@@ -48,7 +47,7 @@ def apes(run: RunDir, whole: Ape, truth: Trajectory) -> list[Ape]:
 
     A recording that is kept apart has a frame of its own, so that it is aligned alone, and called so; one without a pose has no error.
     """
-    stamp, recordings = run.load(Features, "extract").stamp, run.load(Recordings, "extract")
+    stamp, recordings = _recordings(run)
     tracks, map_ = run.load(Tracks, whole.stage), run.load(Map, whole.stage)
     segment, offset = frame_segments(tracks, map_), recordings.recording_offset
     found = []

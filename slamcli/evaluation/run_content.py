@@ -14,7 +14,7 @@ from slamcli.geometry import se3
 from slamcli.runs import placement
 from slamcli.runs.run_directory import RunDir
 from slamcli.runs.staleness import State
-from slamcli.schema import LOST, Closures, Doubt, Features, Ground, Map, Tracks, Trajectory
+from slamcli.schema import LOST, Closures, Doubt, Features, FrameTimes, Ground, Map, Tracks, Trajectory
 
 UPRIGHT = np.array(
     [[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
@@ -36,7 +36,7 @@ class Content:
     T_lc: np.ndarray  # (F, 4, 4), NaN = lost
     state: np.ndarray  # (F,) as in Tracks
     n_inliers: np.ndarray  # (F,)
-    n_features: np.ndarray  # (F,)
+    n_features: np.ndarray  # (F,); empty where extract is not there any more
     is_doubtful: np.ndarray  # (F,) whose pose the run itself doubts
     loops: np.ndarray  # (C, 2) frames
     ground: Ground | None
@@ -45,6 +45,7 @@ class Content:
     no_truth: str  # why there is none, or ""
     x_truth: np.ndarray  # (N, 3) level frame; a row of NaN interrupts it
     states: dict[str, State]
+    cleaned: frozenset[str]  # stages that were deleted on purpose, and those that were made from them
     recording: dict[str, Any]
     doubts: list[str] = field(default_factory=list)  # of the recording's reader
     verdict: Verdict | None = None  # on the map, where there is one
@@ -86,30 +87,32 @@ class Content:
 def collect(run: RunDir) -> Content:
     """Gather a run; it may have ended after any stage from track on."""
     stage = trajectory_error.last_stage(run)
-    features, map_, tracks = run.load(Features, "extract"), run.load(Map, stage), run.load(Tracks, stage)
+    times, map_, tracks = run.load(FrameTimes, stage), run.load(Map, stage), run.load(Tracks, stage)
     ground = run.load(Ground, "densify") if run.record("densify") is not None else None
     T_lw = ground.T_lw if ground is not None else UPRIGHT
     T_lc = T_lw @ schema.frame_poses(tracks, map_)
     truth, no_truth = _truth(run)
-    ape = _ape(run, features.stamp, truth)
-    recording, doubts = _recording(run)
+    ape = _ape(run, times.stamp, truth)
+    recording, doubts = _recording(run, stage)
+    states = run.states()
     return Content(
         name=str(run.info()["dataset"]),
         flag=run.flag,
         stage=stage,
-        stamp=np.array(features.stamp),
+        stamp=np.array(times.stamp),
         T_lc=T_lc,
         state=np.array(tracks.state),
         n_inliers=np.array(tracks.n_inliers),
-        n_features=np.diff(features.offset),
-        is_doubtful=np.array(run.load(Doubt, "loop").is_doubtful) if stage == "loop" else np.zeros(len(features.stamp), dtype=bool),
+        n_features=np.diff(run.load(Features, "extract").offset) if run.record("extract") is not None else np.zeros(0, dtype=np.int64),
+        is_doubtful=np.array(run.load(Doubt, "loop").is_doubtful) if stage == "loop" else np.zeros(len(times.stamp), dtype=bool),
         loops=_loops(run, stage, map_),
         ground=ground,
         ape=ape,
         ape_of=of_several.apes(run, ape[stage], truth) if run.recordings and truth is not None and stage in ape else [],
         no_truth=no_truth,
         x_truth=_truth_in_level(truth, ape.get(stage), T_lw),
-        states=run.states(),
+        states=states,
+        cleaned=frozenset(name for name, state in states.items() if not state.is_fresh and run.is_cleaned(state)),
         recording=recording,
         doubts=doubts,
         verdict=map_verdict.of_run(run),
@@ -160,9 +163,10 @@ def _loops(run: RunDir, stage: str, map_: Map) -> np.ndarray:
     return map_.kf_frame[kf[(map_.kf_segment[kf] == 0).all(axis=1)]]
 
 
-def _recording(run: RunDir) -> tuple[dict[str, Any], list[str]]:
+def _recording(run: RunDir, stage: str) -> tuple[dict[str, Any], list[str]]:
     """Describe the recording and say what its reader doubts; the recording itself may be gone by now."""
-    about: dict[str, Any] = {"root": run.info()["root"], "camera": run.camera().to_dict()}
+    made_by = "extract" if run.record("extract") is not None else stage
+    about: dict[str, Any] = {"root": run.info()["root"], "camera": run.camera(made_by).to_dict()}
     placed = (run.record("loop") or {}).get("summary", {}).get("recordings", [])
     about["recordings"] = {row["name"]: f"{row['located']} of {row['frames']} frames in the common frame" for row in placed}
     try:

@@ -15,9 +15,8 @@ import numpy as np
 
 from slamcli.datasets.association import MAX_DIFFERENCE, associate
 from slamcli.errors import SlamError
-from slamcli.formats.trajectory import read_tum
 from slamcli.geometry import se3
-from slamcli.schema import Doubt, Features, Map, Tracks, Trajectory, trajectory
+from slamcli.schema import Doubt, FrameTimes, Map, Tracks, Trajectory, trajectory
 
 STAGES = ("track", "optimize", "loop")  # in the order they refine the trajectory
 RPE_SECONDS = 1.0  # [s] interval over which drift is measured
@@ -119,25 +118,23 @@ def last_stage(run: Any) -> str:
 
 
 def stage_trajectory(run: Any, stage: str) -> Trajectory:
-    """Return the poses of all frames that have one after a stage; from its file, to the nanometre, where extract was cleared away."""
-    if run.record("extract") is None:
-        return read_tum(run.stage_path(stage, "trajectory.txt"))
-    return trajectory(run.load(Features, "extract").stamp, run.load(Tracks, stage), run.load(Map, stage))
+    """Return the poses of all frames that have one after a stage."""
+    return trajectory(run.load(FrameTimes, stage).stamp, run.load(Tracks, stage), run.load(Map, stage))
 
 
 def sure_part(run: Any, whole: Trajectory) -> Trajectory:
     """Leave out of a run's trajectory the frames whose poses its loop stage doubts; SlamError where that has not been run."""
-    stamp, doubts = run.load(Features, "extract").stamp, run.load(Doubt, "loop")
+    stamp, doubts = run.load(FrameTimes, "loop").stamp, run.load(Doubt, "loop")
     is_sure = ~np.isin(whole.stamp, stamp[doubts.is_doubtful])
     return Trajectory(stamp=whole.stamp[is_sure], T_wc=whole.T_wc[is_sure])
 
 
 def sure_figures(run: Any, found: Ape) -> dict[str, Any]:
     """Count the frames that a run doubts, and give the RMSE [m] of the others; None where another stage's or system's poses were measured."""
-    if found.stage != "loop" or run.record("extract") is None:
+    if found.stage != "loop":
         return {"doubtful": None, "rmse_sure": None}
     doubts = run.load(Doubt, "loop")
-    error = found.error[~np.isin(found.stamp, run.load(Features, "extract").stamp[doubts.is_doubtful])]
+    error = found.error[~np.isin(found.stamp, run.load(FrameTimes, "loop").stamp[doubts.is_doubtful])]
     return {"doubtful": int(doubts.is_doubtful.sum()), "rmse_sure": float(np.sqrt((error**2).mean())) if len(error) else None}
 
 

@@ -133,9 +133,11 @@ def _floor(content: Content) -> list[Remark]:
 
 
 def _stages(content: Content) -> list[Remark]:
-    found, unfit = [], []
+    found, unfit, gone = [], [], list[str]()
     for stage, state in content.states.items():
-        if state.state == MISSING:
+        if stage in content.cleaned:
+            gone += [stage] * (state.state == MISSING)
+        elif state.state == MISSING:
             found.append(Remark(NOTE, f"{stage} has not been run; go on with: slamcli run {content.flag}"))
         elif not state.is_fresh:
             unfit.append(state)
@@ -148,6 +150,9 @@ def _stages(content: Content) -> list[Remark]:
         if len(warnings) > MOST_STAGE_WARNINGS:
             total = state.record.get("n_warnings", len(warnings))
             found.append(Remark(NOTE, f"{stage}: {total} warnings in all; they are in log.txt"))
+    if gone:
+        told = f"{', '.join(gone)} {'was' if len(gone) == 1 else 'were'} cleaned away"
+        found.append(Remark(NOTE, f"{told}: what rests on them is left out here; all is made anew with: slamcli run {content.flag}"))
     if unfit:
         told = f"{unfit[0].stage} is {unfit[0].state} ({unfit[0].reason})"
         rest = f", and so {'is' if len(unfit) == 2 else 'are'} {', '.join(state.stage for state in unfit[1:])}" if len(unfit) > 1 else ""

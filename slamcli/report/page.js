@@ -212,7 +212,7 @@
   };
   if (data.error.length) addChart("absolute pose error", data.error, "mm", 1, 1000);
   addChart("landmarks a pose rests on", data.inliers, "", 0, 1);
-  addChart("features", data.features, "", 0, 1);
+  if (data.features.length) addChart("features", data.features, "", 0, 1);
   if (!data.error.length) addChart("height of the camera", data.position[2], "m", 2, 1);
 
   if (data.state.includes(0)) constant.push("red in the charts: lost");

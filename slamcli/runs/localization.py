@@ -54,7 +54,8 @@ def localize(run: RunDir, recording: Dataset, *, progress: Progress) -> Localize
     Raises SlamError where the run has no map or where no frame was recognized.
     """
     config = run.config()
-    run.stage_path("loop")
+    for stage in ("loop", "match"):
+        run.stage_path(stage)
     with scratch("slamcli-localize-") as folder:
         new = RunDir.create(folder / "run", dataset=recording.name, root=str(recording.root.resolve()), digest=recording.digest())
         new.write_config(config)

@@ -206,7 +206,9 @@ class Pipeline:
         needs = [states[n] for n in stage.needs if n != "dataset"]
         for need in reversed(needs):  # the latest first: its advice brings the others too
             if need.state == staleness.MISSING:
-                raise SlamError(f"{name} needs {need.stage}, which has not been run; try: slamcli run --until {need.stage} {self.run.flag}")
+                raise SlamError(
+                    f"{name} needs {need.stage}, which {self.run.why_missing(need.stage)}: slamcli run --until {need.stage} {self.run.flag}"
+                )
             if need.state == staleness.DAMAGED:
                 raise SlamError(
                     f"{name} needs {need.stage}, which is damaged ({need.reason}); try: slamcli run --until {need.stage} {self.run.flag}"

@@ -237,15 +237,20 @@ class RunDir:
         """Name the folder of a finished stage, or a file in it; SlamError says how to make it when it is not there."""
         path = self.path.joinpath(stage, *names)
         if not (self.path / stage / "stage.json").exists():
-            was_cleaned = stage in self.info().get("cleaned", [])
-            why, remedy = ("was cleaned away", "") if was_cleaned else ("has not been run", f"--until {stage} ")
-            raise SlamError(f"{self.path}: {stage} {why}; try: slamcli run {remedy}{self.flag}")
+            raise SlamError(f"{self.path}: {stage} {self.why_missing(stage)}: slamcli run --until {stage} {self.flag}")
         if not path.exists():
             raise SlamError(f"{path}: not there; make it with: slamcli {stage} {self.flag}")
         if names:
             self.intact(stage, "/".join(names))
         self._warn_unless_fresh(stage)
         return path
+
+    def why_missing(self, stage: str) -> str:
+        """Say why a stage has no folder, as what comes before the command that makes one."""
+        if stage in self.info().get("cleaned", []):
+            return "was cleaned away; bring it back with"
+        is_made_from = any(stage in one.needs and self.record(one.name) is not None for one in STAGES)
+        return "is not there any more; make it anew with" if is_made_from else "has not been run; try"
 
     def intact(self, stage: str, *names: str) -> Path:
         """Return the folder of a finished stage after comparing files of it with the digests recorded; Damaged where one differs."""

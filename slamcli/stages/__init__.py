@@ -34,11 +34,11 @@ STAGES = (
     ),
     Stage(
         "densify",
-        ("dataset", "extract", "loop"),
+        ("dataset", "loop"),
         ("sensor", "densify", "ground"),
         "Join the depth images to a coloured cloud and find the floor.",
     ),
-    Stage("octree", ("dataset", "extract", "loop", "densify"), ("sensor", "octree"), "Build the octree of occupied and free space."),
+    Stage("octree", ("dataset", "loop", "densify"), ("sensor", "octree"), "Build the octree of occupied and free space."),
     Stage("grid2d", ("dataset", "extract", "loop", "densify", "octree"), ("sensor", "grid2d"), "Build the 2-D navigation grid."),
 )
 NAMES = tuple(stage.name for stage in STAGES)

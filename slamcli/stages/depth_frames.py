@@ -10,7 +10,7 @@ from slamcli.datasets import Dataset
 from slamcli.errors import BadFrame
 from slamcli.geometry.camera import Camera
 from slamcli.parallel import ordered_map
-from slamcli.schema import Features, Map, Moving, Tracks, frame_poses
+from slamcli.schema import FrameTimes, Map, Moving, Tracks, frame_poses
 from slamcli.stages.contract import Stored
 from slamcli.stages.measurements import depth_times
 from slamcli.stages.moving_parts import NOTHING, still_depth
@@ -24,11 +24,11 @@ def depth_poses(inputs: Stored, *, frames: str = "key") -> list[PosedFrame]:
 
     frames : "key" frames, or "all" that have a pose
     """
-    features, map_ = inputs.load(Features, "extract"), inputs.load(Map, "loop")
+    times, map_ = inputs.load(FrameTimes, "loop"), inputs.load(Map, "loop")
     T_wc = frame_poses(inputs.load(Tracks, "loop"), map_)
     is_main = map_.kf_segment == 0
     T_wc[map_.kf_frame[is_main]] = map_.T_wk[is_main]
-    T_wd = rolling_shutter.depth_poses(features.stamp, depth_times(inputs, features), T_wc)
+    T_wd = rolling_shutter.depth_poses(times.stamp, depth_times(inputs, times), T_wc)
     chosen = map_.kf_frame[is_main] if frames == "key" else np.flatnonzero(np.isfinite(T_wd[:, 0, 0]))
     return [(int(frame), T_wd[frame]) for frame in chosen]
 

@@ -18,7 +18,7 @@ from slamcli.navigation.driven import mark_driven
 from slamcli.navigation.grid_evidence import View, look
 from slamcli.navigation.robot_pose import planar_pose
 from slamcli.navigation.terrain import Terrain
-from slamcli.schema import Features, Grid, Ground, Map, Moving, Tracks, frame_poses
+from slamcli.schema import FrameTimes, Grid, Ground, Map, Moving, Tracks, frame_poses
 from slamcli.stages.contract import Inputs, Summary, Tools
 from slamcli.stages.depth_frames import PosedFrame, depth_poses, read_depth
 from slamcli.stages.moving_parts import coarse_images
@@ -55,7 +55,7 @@ def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
 def _from_depth(inputs: Inputs, T_lw: np.ndarray, cfg: Config, tools: Tools) -> tuple[Grid, int]:
     option, camera, moving = cfg.grid2d, inputs.camera("loop"), inputs.load(Moving, "loop")
     rays = np.ascontiguousarray(camera.rays)
-    has_depth = np.isfinite(inputs.load(Features, "extract").depth_stamp)
+    has_depth = np.isfinite(inputs.load(FrameTimes, "loop").depth_stamp)
     poses = [(frame, product(T_lw, T_wd)) for frame, T_wd in depth_poses(inputs, frames="all") if has_depth[frame]]
     chosen = grid.spaced(np.array([T_ld for _, T_ld in poses]).reshape(-1, 4, 4), metres=option.spacing, degrees=option.spacing_deg)
 

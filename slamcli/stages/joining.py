@@ -29,6 +29,7 @@ from slamcli.schema import (
     DepthTimes,
     Features,
     Flow,
+    FrameTimes,
     Map,
     Matches,
     Measured,
@@ -133,7 +134,7 @@ def join_track(parts: Sequence[Part], inputs: Inputs, out: Path, cfg: Config, to
     artifacts.save(_moving(parts, inputs.camera()), out)
     rests = [part.made.load(Rests, "track").rest_span + np.int32(at) for part, at in zip(parts, offset, strict=False)]
     artifacts.save(Rests(rest_span=np.concatenate(rests)), out)
-    save_map(out, features.stamp, tracks, map_)
+    save_map(out, inputs.load(FrameTimes, "extract"), tracks, map_)
     spans = [
         [first + int(at), last + int(at), reason]
         for part, at in zip(parts, offset, strict=False)
@@ -159,7 +160,7 @@ def join_optimize(parts: Sequence[Part], inputs: Inputs, out: Path, cfg: Config,
             )
     features, offset, camera = inputs.load(Features, "extract"), inputs.load(Recordings, "extract").recording_offset, inputs.camera()
     tracks, map_ = _joined_map(parts, "optimize", features, offset)
-    save_map(out, features.stamp, tracks, map_)
+    save_map(out, inputs.load(FrameTimes, "extract"), tracks, map_)
     timings = [part.made.load(Timing, "optimize") for part in parts]
     twist = np.concatenate([timing.twist for timing in timings])
     artifacts.save(Timing(np.array(0.0), np.array(np.nan), np.array(0.0), twist=twist), out)

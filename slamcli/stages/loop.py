@@ -12,7 +12,7 @@ from slamcli.config.options import Config
 from slamcli.depth.coarse_images import CoarseImages
 from slamcli.errors import SlamError
 from slamcli.formats.g2o import write_g2o
-from slamcli.schema import LOST, Closures, DepthTimes, Map, Moving, Recordings, Rests, Timing, Tracks, Words, frame_segments
+from slamcli.schema import LOST, Closures, DepthTimes, FrameTimes, Map, Moving, Recordings, Rests, Timing, Tracks, Words, frame_segments
 from slamcli.slam import doubt, final_refinement, loop_pose_graph, map_segments, pose_doubt
 from slamcli.slam.common_place import Jury
 from slamcli.slam.depth_tracking import FramePoints
@@ -49,7 +49,7 @@ def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
 
     write_pose_graph(out / "posegraph.g2o", map_.T_wk, loop_pose_graph.build(sparse_map, accepted, cfg.loop))
     write_candidates(out / "candidates.csv", tried)
-    save_map(out, features.stamp, tracks, map_)
+    save_map(out, inputs.load(FrameTimes, "extract"), tracks, map_)
     several = place_recordings(inputs, out, tracks, map_) if when.is_of_several else None
     for apart in several.warnings() if several is not None else segments_apart(tracks, map_):
         tools.warn(apart)

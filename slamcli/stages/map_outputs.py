@@ -6,17 +6,18 @@ import numpy as np
 
 from slamcli import artifacts
 from slamcli.formats import trajectory as trajectory_file
-from slamcli.schema import Map, Tracks, Trajectory, frame_segments, trajectory
+from slamcli.schema import FrameTimes, Map, Tracks, Trajectory, frame_segments, trajectory
 from slamcli.slam import map_segments
 
 
-def save_map(out: Path, stamp: np.ndarray, tracks: Tracks, map_: Map) -> None:
-    """Write the map, the poses of all frames, the trajectory of the frames and that of the key frames.
+def save_map(out: Path, times: FrameTimes, tracks: Tracks, map_: Map) -> None:
+    """Write the map, the times and poses of all frames, the trajectory of the frames and that of the key frames.
 
     Other map segments than the main one have a trajectory each, in a frame of its own.
     """
-    artifacts.save(map_, out)
-    artifacts.save(tracks, out)
+    for artifact in (map_, tracks, times):
+        artifacts.save(artifact, out)
+    stamp = times.stamp
     trajectory_file.write_tum(out / "trajectory.txt", trajectory(stamp, tracks, map_))
     trajectory_file.write_tum(out / "keyframes.txt", key_frame_trajectory(stamp, map_))
     for segment in range(1, map_segments.n_segments(map_)):

@@ -7,7 +7,7 @@ import numpy as np
 from slamcli.calibration import self_calibration
 from slamcli.calibration.self_calibration import Sensing
 from slamcli.geometry.camera import Camera
-from slamcli.schema import DepthTimes, Features, Measured, Timing
+from slamcli.schema import DepthTimes, Features, FrameTimes, Measured, Timing
 from slamcli.slam.moving_objects import OUT_OF_SIGHT
 from slamcli.stages.contract import Stored
 
@@ -25,7 +25,7 @@ def corrected(stored: Stored, features: Features, given: Camera, sensing: Sensin
     )
 
 
-def depth_times(stored: Stored, features: Features) -> np.ndarray:
+def depth_times(stored: Stored, times: FrameTimes) -> np.ndarray:
     """Return when each frame's depth was measured, (F,) [s], NaN where there is none or it is not moved; known once loop has been run."""
     when = stored.load(Timing, "loop")
-    return stored.load(DepthTimes, "loop").depth_time if when.is_of_several else features.depth_stamp + float(when.depth_delay)
+    return stored.load(DepthTimes, "loop").depth_time if when.is_of_several else times.depth_stamp + float(when.depth_delay)

@@ -85,8 +85,9 @@ class Placed:
         return told
 
     def save(self, out: Path, depth_times: DepthTimes) -> None:
-        """Write what a single recording's run has no need of: when depth was measured, and each recording's trajectory with its own stamps."""
+        """Write what one recording's run has no need of: when depth was measured, whose each frame is, a trajectory of each recording."""
         artifacts.save(depth_times, out)
+        artifacts.save(self.recordings, out)
         for number, name in enumerate(self.names):
             trajectory_file.write_tum(out / recording_file(name), self.trajectory(number))
 

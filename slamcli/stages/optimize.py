@@ -10,7 +10,7 @@ from slamcli import artifacts
 from slamcli.calibration import measurement_derivatives, rolling_shutter, self_calibration
 from slamcli.calibration.self_calibration import Sensing
 from slamcli.config.options import Config
-from slamcli.schema import Features, Map, Moving, Rests, Timing, Tracks
+from slamcli.schema import Features, FrameTimes, Map, Moving, Rests, Timing, Tracks
 from slamcli.slam import calibration_doubt, doubt, final_refinement, map_segments, rests
 from slamcli.slam.depth_tracking import NO_FRAME_POINTS, FramePoints
 from slamcli.slam.final_refinement import DepthEdges
@@ -42,7 +42,7 @@ def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
             tools.warn(one.text)
         summary |= doubt.to_summary(doubts)
         map_ = map_segments.anchored(sparse_map.snapshot(), tracks)
-    save_map(out, features.stamp, tracks, map_)
+    save_map(out, inputs.load(FrameTimes, "extract"), tracks, map_)
     artifacts.save(sensing.timing, out)
     write_camera(out, sensing.camera)
     return {"frames": len(features.stamp), "key_frames": len(map_.kf_frame)} | figures(sensing) | summary

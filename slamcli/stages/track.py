@@ -12,6 +12,7 @@ from slamcli.schema import (
     ON_DEPTH,
     RELOCALIZED,
     Features,
+    FrameTimes,
     Matches,
     Moving,
     Rests,
@@ -46,7 +47,7 @@ def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
     lost = lost_spans(tracks.state, tracker.lost_reason)
     for first, last, reason in lost:
         tools.warn(f"frames {first} to {last} are lost: {reason}" if last > first else f"frame {first} is lost: {reason}")
-    save_map(out, features.stamp, tracks, map_)
+    save_map(out, inputs.load(FrameTimes, "extract"), tracks, map_)
     return {
         "frames": len(features.stamp),
         "tracked": int((tracks.state != LOST).sum()),

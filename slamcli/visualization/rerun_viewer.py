@@ -148,7 +148,8 @@ def _grid_mesh(rr: Any, grid: Grid) -> Any:
 def _log_frames(rr: Any, recording: Any, run: RunDir, content: Content, images: int, progress: Progress) -> None:
     """Log every frame's pose and curves, and some frames' images with features."""
     n = len(content.stamp)
-    features, camera = run.load(Features, "extract"), run.camera()
+    features = run.load(Features, "extract") if run.record("extract") is not None else None
+    camera = run.camera("extract" if features is not None else content.stage)
     pinhole = rr.Pinhole(image_from_camera=camera.K, resolution=[camera.width, camera.height], image_plane_distance=0.3)
     recording.log("world/camera/image", pinhole, static=True)
     dataset = _dataset(run) if images > 0 else None
@@ -166,7 +167,8 @@ def _log_frames(rr: Any, recording: Any, run: RunDir, content: Content, images: 
         else:
             recording.log("world/camera", rr.Clear(recursive=False))
         recording.log("curves/inliers", rr.Scalars(int(content.n_inliers[i])))
-        recording.log("curves/features", rr.Scalars(int(content.n_features[i])))
+        if features is not None:
+            recording.log("curves/features", rr.Scalars(int(content.n_features[i])))
         if np.isfinite(error[i]):
             recording.log("curves/error", rr.Scalars(float(error[i])))
         if dataset is not None and i % step == 0:
@@ -180,14 +182,16 @@ def _dataset(run: RunDir) -> Dataset | None:
         return None
 
 
-def _log_image(rr: Any, recording: Any, dataset: Dataset, features: Features, moving: Moving, i: int) -> None:
-    """Log an image with its features, what moves in it tinted."""
+def _log_image(rr: Any, recording: Any, dataset: Dataset, features: Features | None, moving: Moving, i: int) -> None:
+    """Log an image with its features, where they are known, what moves in it tinted."""
     try:
         image = cv2.cvtColor(moving_tint.tinted(dataset.rgb(i), moving, i, dataset.camera), cv2.COLOR_RGB2BGR)
     except BadFrame:
         return
     _, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
     recording.log("world/camera/image", rr.EncodedImage(contents=data.tobytes(), media_type="image/jpeg"))
+    if features is None:
+        return
     rows = slice(int(features.offset[i]), int(features.offset[i + 1]))
     has_depth = np.isfinite(features.depth[rows])
     colours = np.where(has_depth[:, None], WITH_DEPTH, WITHOUT_DEPTH).astype(np.uint8)

@@ -18,7 +18,7 @@ from slamcli.geometry import se3
 from slamcli.navigation.robot_pose import OPTICAL_IN_BODY
 from slamcli.runs import pipeline, placement
 from slamcli.runs.run_directory import RunDir
-from slamcli.schema import CoarseDepth, Features, Grid, Ground, Map, Moving, Timing, Tracks
+from slamcli.schema import CoarseDepth, FrameTimes, Grid, Ground, Map, Moving, Timing, Tracks
 from slamcli.stages import grid2d, stage_named
 
 
@@ -205,19 +205,9 @@ class Inputs:
         lost = np.arange(n) == 7
         T_kc = np.tile(np.eye(4), (n, 1, 1))
         T_kc[lost] = np.nan
-        stamp, empty = 0.2 * np.arange(n), np.empty(0)
+        stamp = 0.2 * np.arange(n)
         self._values = {
-            Features: Features(
-                stamp,
-                stamp,
-                np.zeros(n + 1, np.int64),
-                np.empty((0, 2), np.float32),
-                empty.astype("f4"),
-                np.empty((0, 2), np.float32),
-                *[empty.astype(t) for t in ("u1", "f4")],
-                np.empty((0, 32), np.uint8),
-                np.array(1.2),
-            ),
+            FrameTimes: FrameTimes(stamp, stamp),
             CoarseDepth: encode(np.zeros((n, 0, 0), np.uint16), (0, 0)),
             Moving: Moving(),
             Ground: Ground(T_lw, plane, np.array(0.01), np.array(0.9), np.array(is_found)),

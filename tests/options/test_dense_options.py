@@ -17,7 +17,7 @@ from slamcli.formats import cloud, octomap
 from slamcli.geometry import se3
 from slamcli.navigation import floor_paper, surface_patches
 from slamcli.navigation.floor import find_ground
-from slamcli.schema import Features, Ground, Map, Moving, Timing, Tracks
+from slamcli.schema import FrameTimes, Ground, Map, Moving, Timing, Tracks
 from slamcli.stages import densify, octree
 
 BOX = (((2.2, 1.4, 0.0), (2.8, 2.2, 0.6)),)
@@ -41,7 +41,7 @@ class Drive:
         stamp = kf / 30.0
         self.runs, self.warnings = runs, []
         self._records = {
-            Features: SimpleNamespace(stamp=stamp, depth_stamp=stamp),
+            FrameTimes: SimpleNamespace(stamp=stamp, depth_stamp=stamp),
             Map: Map(kf, 0 * kf, T_wk, none.reshape(0, 3), none.astype("i4"), none.astype("i4"), none.astype("i8")),
             Tracks: Tracks(kf, np.tile(np.eye(4), (n, 1, 1)), none, none),
             Timing: Timing(np.array(0.0), np.array(0.0), np.array(0.0), np.zeros((n, 6))),

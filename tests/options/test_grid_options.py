@@ -18,7 +18,7 @@ from slamcli.formats import octomap
 from slamcli.geometry.octree import DEPTH, Octree
 from slamcli.navigation import grid
 from slamcli.navigation.grid import FREE, OCCUPIED, build_grid
-from slamcli.schema import CoarseDepth, Features, Grid, Ground, Map, Moving, Timing, Tracks
+from slamcli.schema import CoarseDepth, FrameTimes, Grid, Ground, Map, Moving, Timing, Tracks
 from slamcli.stages import grid2d
 
 SETTINGS = GridConfig(stride=1, min_range=0.5, n_low=3, n_high=8)  # of images a quarter as wide as a Kinect's
@@ -145,7 +145,7 @@ class Drive:
         plane = np.array([0.0, 0.0, 1.0, 0.0])
         kf, ref = np.zeros(1, np.int32), np.zeros(n, np.int32)
         self._records = {
-            Features: SimpleNamespace(stamp=stamp, depth_stamp=stamp),
+            FrameTimes: SimpleNamespace(stamp=stamp, depth_stamp=stamp),
             Ground: Ground(np.eye(4), plane, np.array(0.0), np.array(1.0), np.array(True)),
             Map: Map(kf, 0 * kf, self.T_lc[:1], none.reshape(0, 3), none.astype("i4"), none.astype("i4"), none.astype("i8")),
             Tracks: Tracks(ref, np.linalg.inv(self.T_lc[0]) @ self.T_lc, none, none),

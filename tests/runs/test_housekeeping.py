@@ -6,6 +6,7 @@ import zipfile
 from pathlib import Path
 
 import finished
+import numpy as np
 import pytest
 
 from slamcli.cli import plan
@@ -13,6 +14,12 @@ from slamcli.errors import SlamError
 from slamcli.runs import housekeeping
 from slamcli.runs.run_directory import RunDir
 from slamcli.runs.staleness import MISSING
+from slamcli.schema import Grid
+
+NOTHING_SEEN = Grid(
+    p_occupied=np.full((4, 4), np.nan, np.float32), n_seen=np.zeros((4, 4), np.int32), state=np.full((4, 4), -1, np.int8),
+    origin=np.zeros(2), resolution=np.array(0.05),
+)  # fmt: skip
 
 
 @pytest.fixture
@@ -52,11 +59,69 @@ def test_clean_keeps_the_results_and_says_what_it_freed(made, slamcli, tmp_path)
         result = slamcli(*command, "-r", "mine")
         assert result.exit_code == 0, result.stderr
         assert "Warning" not in result.stderr  # it was cleaned on purpose
-    assert "extract was cleaned away; try: slamcli run -r runs/mine" in slamcli("report", "-r", "mine").stderr
     assert slamcli("clean", "-r", "mine").exit_code == 2
     lines = slamcli("status", "-r", "mine").stdout.splitlines()[1:]
     assert [line.split()[1] for line in lines[:6]] == ["cleaned"] * 4 + ["kept"] * 2
     assert "stale" not in "".join(lines)
+
+
+@pytest.fixture
+def whole(room_run: Path, here: Path) -> Path:
+    """A copy of a finished run of the simulated room, with its grid, at runs/room."""
+    shutil.copytree(room_run, here / "runs" / "room")
+    return Path("runs/room")
+
+
+FROM_RESULTS = (
+    "export-trajectory t.txt", "export-trajectory t.csv --sure-only --frame level", "export-trajectory g.g2o", "export-cloud c.ply --frame world",
+    "export-octree m.bt", "export-octree m.ot --colour", "export-mesh s.ply --voxel 0.1", "export-grid g.pgm --costs costs.pgm",
+    "export-nerfstudio nerf --images jpg", "render c.png --path", "render o.png --what octree", "render p.png --what plan",
+    "eval ape", "eval rpe", "eval map", "report -o r.html", "compare runs/room runs/room", "status", "list",
+    "localize runs/room ROOM --out l.txt", "export-colmap colmap --text",
+)  # fmt: skip
+NEEDS = {"export-colmap": "extract", "localize": "match"}  # what reads more than results, and the stage that it names
+GIVEN_BY_NAME = ("compare", "list", "localize")
+
+
+@pytest.mark.parametrize("is_cleaned", [True, False])
+def test_every_export_works_from_what_is_kept_or_says_how_to_bring_the_rest_back(
+    whole: Path, room: Path, slamcli, is_cleaned: bool
+) -> None:
+    """Deleting extract by hand stops no more than cleaning does; and what stays comes out the same as from the whole run."""
+    before = slamcli("export-trajectory", "before.txt", "-r", "room"), slamcli("eval", "rpe", "--json", "-r", "room")
+    assert all(result.exit_code == 0 for result in before)
+    if is_cleaned:
+        housekeeping.clean(RunDir.find("room"))
+    else:
+        for stage in ("extract", "match"):
+            shutil.rmtree(whole / stage)
+    why = "was cleaned away; bring it back with" if is_cleaned else "is not there any more; make it anew with"
+    for words in FROM_RESULTS:
+        name, *rest = words.replace("ROOM", str(room)).split()
+        result = slamcli(name, *rest, *(() if name in GIVEN_BY_NAME else ("-r", "room")))
+        assert not isinstance(result.exception, Exception) or isinstance(result.exception, SystemExit), (words, result.exception)
+        if name in NEEDS:
+            assert result.exit_code == 1, words
+            assert (
+                result.stderr.splitlines()[-1] == f"Error: runs/room: {NEEDS[name]} {why}: slamcli run --until {NEEDS[name]} -r runs/room"
+            )
+        else:
+            assert result.exit_code == 0, (words, result.stderr)
+            assert not is_cleaned or "stale" not in result.stdout + result.stderr, words
+    assert Path("t.txt").read_bytes() == Path("before.txt").read_bytes()
+    assert slamcli("eval", "rpe", "--json", "-r", "room").stdout == before[1].stdout
+    if is_cleaned:
+        assert "extract, match, track, optimize were cleaned away" in Path("r.html").read_text()
+    assert slamcli("run", "--until", "extract", "-r", "room").exit_code == 0
+    result = slamcli("export-colmap", "colmap", "-r", "room")
+    assert result.exit_code == 0 and len(list(Path("colmap/images").iterdir())) > 1, result.stderr
+
+
+def test_a_map_stage_needs_no_features(whole: Path, slamcli) -> None:
+    housekeeping.clean(RunDir.find("room"))
+    for stage in ("densify", "octree"):
+        result = slamcli(stage, "-r", "room")
+        assert result.exit_code == 0, result.stderr
 
 
 def test_a_missing_stage_that_nobody_cleaned_away_is_still_warned_of(made, slamcli) -> None:
@@ -117,6 +182,6 @@ def test_a_plan_with_walls_refuses_a_damaged_cloud(made) -> None:
     before = cloud.read_bytes()
     cloud.write_bytes(before[:-1] + bytes([before[-1] ^ 1]))
     with pytest.raises(SlamError, match="other content than recorded"):
-        plan._walls(RunDir.find("mine"))
+        plan._walls(RunDir.find("mine"), NOTHING_SEEN)
     cloud.unlink()
-    assert plan._walls(RunDir.find("mine")) == []
+    assert plan._walls(RunDir.find("mine"), NOTHING_SEEN) == []

@@ -64,5 +64,5 @@ def test_a_run_without_a_map_says_what_to_do(slamcli, room, room_run, tmp_path):
     shutil.copytree(room_run, run)
     shutil.rmtree(run / "loop")
     told = slamcli("localize", run, room, "--out", tmp_path / "t.txt")
-    assert told.exit_code == 1 and "loop has not been run; try: slamcli run --until loop" in told.output
+    assert told.exit_code == 1 and "loop is not there any more; make it anew with: slamcli run --until loop" in told.output
     assert not (tmp_path / "t.txt").exists()

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -193,8 +194,11 @@ def test_a_missing_stage_is_named_with_the_command_that_makes_it(run: RunDir, ca
     assert not caplog.text
     with pytest.raises(SlamError, match=r"loop/cloud.ply: not there; make it with: slamcli loop"):
         run.stage_path("loop", "cloud.ply")
-    (run.path / "loop" / "out.txt").unlink()
-    (run.path / "loop" / "stage.json").unlink()
+    shutil.rmtree(run.path / "loop")
+    with pytest.raises(SlamError, match="loop is not there any more; make it anew with: slamcli run --until loop"):
+        run.stage_path("loop")
+    for stage in ("densify", "octree", "grid2d"):
+        shutil.rmtree(run.path / stage)
     with pytest.raises(SlamError, match="loop has not been run; try: slamcli run --until loop"):
         run.stage_path("loop")
 

@@ -18,7 +18,7 @@ from slamcli.datasets.simulate import Simulation, build, simulate
 from slamcli.dense import occupancy
 from slamcli.formats import cloud, octomap
 from slamcli.geometry import se3
-from slamcli.schema import Features, Ground, Map, Moving, Timing, Tracks
+from slamcli.schema import FrameTimes, Ground, Map, Moving, Timing, Tracks
 from slamcli.stages import densify, octree
 from slamcli.stages.depth_frames import depth_poses
 
@@ -41,7 +41,7 @@ class Inputs:
         n, none = len(self.dataset), np.zeros(0)
         kf = np.arange(n, dtype=np.int32)[frames]
         self._records = {
-            Features: SimpleNamespace(stamp=self.dataset.stamp, depth_stamp=self.dataset.depth_stamp),
+            FrameTimes: SimpleNamespace(stamp=self.dataset.stamp, depth_stamp=self.dataset.depth_stamp),
             Map: Map(kf, 0 * kf, T_wc[kf], none.reshape(0, 3), none.astype("i4"), none.astype("i4"), none.astype("i8")),
         }
         ref_kf = (np.arange(n, dtype=np.int32) // (frames.step or 1)).clip(max=len(kf) - 1)
@@ -54,7 +54,7 @@ class Inputs:
 
     def delay_depth(self, seconds: float) -> None:
         """Let the stamps of the depth images be early by this much, and optimize have found it out."""
-        self._records[Features].depth_stamp = self._records[Features].depth_stamp - seconds
+        self._records[FrameTimes].depth_stamp = self._records[FrameTimes].depth_stamp - seconds
         self._records[Timing] = replace(self._records[Timing], depth_delay=np.array(seconds))
 
     def camera(self, stage: str = "extract"):
@@ -288,7 +288,7 @@ class Drive(Inputs):
         T_wk, kf, none = self.T_wl @ np.array(T_lc), np.arange(n, dtype=np.int32), np.zeros(0)
         stamp = kf / 30.0
         self._records = {
-            Features: SimpleNamespace(stamp=stamp, depth_stamp=stamp),
+            FrameTimes: SimpleNamespace(stamp=stamp, depth_stamp=stamp),
             Map: Map(kf, 0 * kf, T_wk, none.reshape(0, 3), none.astype("i4"), none.astype("i4"), none.astype("i8")),
             Tracks: Tracks(kf, np.tile(np.eye(4), (n, 1, 1)), none, none),
             Timing: Timing(np.array(0.0), np.array(0.0), np.array(0.0), np.zeros((n, 6))),
