@@ -18,7 +18,7 @@ from slamcli.geometry import se3, voxel
 from slamcli.runs.run_directory import RunDir
 from slamcli.schema import Moving
 from slamcli.stages import densify
-from slamcli.stages.depth_frames import depth_poses
+from slamcli.stages.depth_frames import DepthFrames, depth_poses
 
 SIDE, SHIFT = 0.02, 0.007  # [m] of the voxels compared, and of their borders from those of the fit
 LEAST_SHARED = 1000  # voxels that two key frames share, and a tile a tenth of
@@ -32,15 +32,14 @@ def main() -> None:
     parser.add_argument("run")
     folder = RunDir.find(parser.parse_args().run)
     config, camera, poses = folder.config(), folder.camera("loop"), depth_poses(folder)
-    read = folder.dataset(), camera, poses, config.sensor, config.densify
-    moving, workers = folder.load(Moving, "loop"), config.run.workers
-    found = densify.find_colours(*read, moving=moving, workers=workers)
+    depths = DepthFrames(folder.dataset(), camera, folder.load(Moving, "loop"), config.run.workers)
+    found = densify.find_colours(depths, poses, config.sensor, config.densify)
     kinds = {
         "as recorded": densify.AS_RECORDED,
         "gains": densify.Colours(found.log_gain, densify.AS_RECORDED.shading),
         "gains and shading": found,
     }
-    samples = [Sampled.of(view, list(kinds.values())) for view in densify.views(*read, moving=moving, workers=workers)]
+    samples = [Sampled.of(view, list(kinds.values())) for view in densify.views(depths, poses, config.sensor, config.densify)]
     rows = np.array(list(differences(samples)))
     corner = found.shading[0, 0] / found.shading[camera.height // 2, camera.width // 2]
     spread = np.exp(np.std(list(found.log_gain.values()), axis=0))

@@ -29,7 +29,6 @@ from slamcli.config.options import Config, MatchConfig
 from slamcli.errors import SlamError
 from slamcli.formats import vocabulary_file
 from slamcli.parallel import ordered_map
-from slamcli.stages.extract import detect as detect_under
 from slamcli.vision import bag_of_words, hamming, orb, vocabulary
 from slamcli.vision.comparison import evenness, plain_orb
 
@@ -152,7 +151,7 @@ def matched(
 
 def brute(a: orb.KeyPoints, b: orb.KeyPoints) -> tuple[np.ndarray, np.ndarray]:
     """Match all with all."""
-    return hamming.match_brute(a.desc, b.desc, a.angle, b.angle)
+    return hamming.match_brute(hamming.Described(a.desc, a.angle), hamming.Described(b.desc, b.angle))
 
 
 class ByNode:
@@ -170,7 +169,7 @@ class ByNode:
 
     def __call__(self, a: orb.KeyPoints, b: orb.KeyPoints) -> tuple[np.ndarray, np.ndarray]:
         """Match two frames."""
-        return hamming.match_nodes(a.desc, self.nodes(a), b.desc, self.nodes(b), a.angle, b.angle)
+        return hamming.match_nodes(*(hamming.Described(points.desc, points.angle, self.nodes(points)) for points in (a, b)))
 
 
 def recall(recording: Recording, detect: Detector, words: vocabulary.Vocabulary) -> dict[str, float]:
@@ -222,7 +221,7 @@ def table(title: str, rows: Iterable[tuple[str, dict[str, float]]]) -> Iterator[
 
 def report(recording: Recording, settings: Config, n_pairs: int) -> Iterator[str]:
     """Measure everything on one recording."""
-    detectors = {"OpenCV ORB": plain_orb, "slamcli": partial(detect_under, settings=settings.extract)}
+    detectors = {"OpenCV ORB": plain_orb, "slamcli": partial(orb.detect, settings=settings.extract)}
     ours = detectors["slamcli"]
     near, far = recording.pairs(apart=1, wanted=n_pairs), recording.pairs(apart=10, wanted=n_pairs)
     images = [recording.grey(i) for i, _ in far]

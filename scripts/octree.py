@@ -30,7 +30,7 @@ from slamcli.geometry.octree import Octree, expand, prune
 from slamcli.parallel import one_thread_in_blas
 from slamcli.runs.run_directory import RunDir
 from slamcli.schema import Features, Ground, Map
-from slamcli.stages.depth_frames import depth_poses
+from slamcli.stages.depth_frames import DepthFrames, depth_poses
 from slamcli.stages.octree import scans
 
 MODEL = {"hit": 0.7, "miss": 0.4, "clamp_min": 0.1192, "clamp_max": 0.971}  # OctoMap's own
@@ -59,7 +59,7 @@ def agreement(run: RunDir) -> list[str]:
     for frames in (kf, np.setdiff1d((kf[:-1] + kf[1:]) // 2, kf)):
         poses = [(int(frame), T_lw @ T_wd[frame]) for frame in frames if frame in T_wd]
         found = occupancy.accuracy(
-            tree, scans(run.dataset(), run.camera(), poses, config.sensor, config.octree), max_range=config.octree.max_range
+            tree, scans(DepthFrames(run.dataset(), run.camera()), poses, config.sensor, config.octree), max_range=config.octree.max_range
         )
         out += [f"{100 * found.share:.2f} %", str(found.correct + found.wrong), str(found.unknown)]
     return out

@@ -25,6 +25,7 @@ def inspect_features(recording: str, frame: int, out: Path, data: str | None, fe
     import cv2
 
     from slamcli import files
+    from slamcli.config.options import ExtractConfig
     from slamcli.datasets import open_dataset
     from slamcli.errors import SlamError
     from slamcli.runs.run_directory import RunDir
@@ -35,7 +36,7 @@ def inspect_features(recording: str, frame: int, out: Path, data: str | None, fe
     if frame >= len(dataset):
         raise SlamError(f"{recording}: has no frame {frame}; its {len(dataset)} frames are 0 to {len(dataset) - 1}")
     grey = dataset.grey(frame)
-    found = {"OpenCV ORB": comparison.plain_orb(grey, features), "slamcli": orb.detect(grey, features=features)}
+    found = {"OpenCV ORB": comparison.plain_orb(grey, features), "slamcli": orb.detect(grey, ExtractConfig(features=features))}
     figures = {}
     for name, points in found.items():
         even = comparison.evenness(points.xy, dataset.camera.width, dataset.camera.height)

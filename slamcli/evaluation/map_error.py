@@ -15,7 +15,7 @@ from slamcli.geometry import se3
 from slamcli.navigation import grid
 from slamcli.runs.run_directory import RunDir
 from slamcli.schema import FrameTimes, Grid, Ground, Map, Moving, Tracks, frame_poses
-from slamcli.stages.depth_frames import depth_poses
+from slamcli.stages.depth_frames import DepthFrames, depth_poses
 from slamcli.stages.octree import scans
 
 Progress = Callable[..., Iterable]
@@ -29,16 +29,8 @@ def octree_accuracy(run: RunDir, *, progress: Progress) -> dict[str, Any]:
     tree, config = octomap.read(run.stage_path("octree", "map.ot")), run.config()
     T_lw = run.load(Ground, "densify").T_lw
     poses = [(frame, T_lw @ T_wk) for frame, T_wk in depth_poses(run, frames="key")]
-    moving = run.load(Moving, "loop")
-    replay = scans(
-        run.dataset(),
-        run.camera("loop"),
-        progress(poses, "eval map"),
-        config.sensor,
-        config.octree,
-        moving=moving,
-        workers=config.run.workers,
-    )
+    depths = DepthFrames(run.dataset(), run.camera("loop"), run.load(Moving, "loop"), config.run.workers)
+    replay = scans(depths, progress(poses, "eval map"), config.sensor, config.octree)
     found = occupancy.accuracy(tree, replay, max_range=config.octree.max_range)
     share = float(found.share) if np.isfinite(found.share) else None
     return {"accuracy": share, "correct": found.correct, "wrong": found.wrong, "unknown": found.unknown, "scans": len(poses)}

@@ -34,7 +34,7 @@ def _pairs(dataset: Dataset) -> Iterator[tuple[Seen, Seen]]:
             continue
         if first is not None and second is not None:
             (a, of_a), (b, of_b) = first, second
-            rows, _ = hamming.match_brute(a.desc, b.desc, a.angle, b.angle)
+            rows, _ = hamming.match_brute(hamming.Described(a.desc, a.angle), hamming.Described(b.desc, b.angle))
             yield Seen(of_a.xy[rows[:, 0]], of_a.depth[rows[:, 0]]), Seen(of_b.xy[rows[:, 1]], of_b.depth[rows[:, 1]])
 
 

@@ -13,7 +13,7 @@ from slamcli.dense.tsdf import Mesh, Volume
 from slamcli.runs.run_directory import RunDir
 from slamcli.schema import Ground, Moving
 from slamcli.stages import densify
-from slamcli.stages.depth_frames import depth_poses
+from slamcli.stages.depth_frames import DepthFrames, depth_poses
 
 SHARPEST, BLURRED = 1.5, 0.5  # a view's quality stays between these, as shares of the middle one's
 
@@ -23,11 +23,11 @@ class RunSurface:
 
     def __init__(self, folder: RunDir, *, voxel: float, even_colours: bool | None = None) -> None:
         """`voxel` is the surface's resolution [m]; colours are evened out as the run did, unless said otherwise."""
-        self._folder, self._config, self._camera = folder, folder.config(), folder.camera("loop")
+        self._config, self._camera = folder.config(), folder.camera("loop")
         self._option = replace(self._config.densify, method="tsdf", voxel=voxel)
         self._is_even = self._option.even_colours if even_colours is None else even_colours
-        self._T_lw, self._moving = folder.load(Ground, "densify").T_lw, folder.load(Moving, "loop")
-        self._poses = depth_poses(folder)
+        self._T_lw, self._poses = folder.load(Ground, "densify").T_lw, depth_poses(folder)
+        self._depths = DepthFrames(folder.dataset(), self._camera, folder.load(Moving, "loop"), self._config.run.workers)
 
     def mesh(self) -> Mesh:
         """Integrate the key frames' depth, without what moves, to a surface with coloured vertices."""
@@ -50,11 +50,7 @@ class RunSurface:
     def _colours(self) -> densify.Colours:
         if not self._is_even:
             return densify.AS_RECORDED
-        config, poses = self._config, console.progress(self._poses, "colours")
-        read = self._folder.dataset(), self._camera, poses, config.sensor, self._option
-        return densify.find_colours(*read, moving=self._moving, workers=config.run.workers)
+        return densify.find_colours(self._depths, console.progress(self._poses, "colours"), self._config.sensor, self._option)
 
     def _views(self, name: str) -> Iterator[densify.View]:
-        config, poses = self._config, console.progress(self._poses, name)
-        read = self._folder.dataset(), self._camera, poses, config.sensor, self._option
-        return densify.views(*read, moving=self._moving, workers=config.run.workers)
+        return densify.views(self._depths, console.progress(self._poses, name), self._config.sensor, self._option)

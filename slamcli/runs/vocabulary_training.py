@@ -7,6 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from slamcli.config.options import ExtractConfig
 from slamcli.datasets import open_dataset
 from slamcli.errors import BadFrame, SlamError
 from slamcli.parallel import ordered_map
@@ -32,7 +33,7 @@ def descriptors(
 
 def _describe(features: int, picture: Picture) -> np.ndarray:
     try:
-        return orb.detect(picture(), features=features).desc
+        return orb.detect(picture(), ExtractConfig(features=features)).desc
     except BadFrame:
         return orb.no_key_points().desc
 

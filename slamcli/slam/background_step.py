@@ -194,10 +194,8 @@ class StepFinder:
         first_r, first_i = (int(self._features.offset[frame]) for frame in (reference, i))
         in_r, in_i = (slice(int(self._features.offset[frame]), int(self._features.offset[frame + 1])) for frame in (reference, i))
         features, node = self._features, self._words.node
-        row, _ = hamming.match_nodes(
-            features.desc[in_i], node[in_i], features.desc[in_r], node[in_r], features.angle[in_i], features.angle[in_r],
-            max_distance=MAX_DISTANCE, ratio=RATIO, check_rotation=True,
-        )  # fmt: skip
+        here, there = (hamming.Described(features.desc[rows], features.angle[rows], node[rows]) for rows in (in_i, in_r))
+        row, _ = hamming.match_nodes(here, there, max_distance=MAX_DISTANCE, ratio=RATIO)
         return first_r + row[:, 1].astype(np.int64), first_i + row[:, 0].astype(np.int64)
 
     def _surface_points(self, frame: int) -> OrientedPoints:

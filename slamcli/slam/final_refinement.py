@@ -30,32 +30,33 @@ class DepthEdges:
     weight: float = 1.0  # factor on the information of all edges in the adjustment
 
 
+@dataclass(frozen=True)
+class Refinement:
+    """By what a map and its frames are refined."""
+
+    settings: TrackConfig
+    depth: DepthEdges
+    iterations: int  # of the adjustment
+    stands_still: Rests = rests.NONE  # when the camera does: the frames of a rest get one pose
+
+
 def refine_all(
-    sparse_map: SparseMap,
-    frames: FrameStore,
-    tracks: Tracks,
-    settings: TrackConfig,
-    *,
-    depth: DepthEdges,
-    iterations: int,
-    progress,
-    workers: int = 1,
-    stands_still: Rests = rests.NONE,
+    sparse_map: SparseMap, frames: FrameStore, tracks: Tracks, by: Refinement, *, progress, workers: int = 1
 ) -> tuple[Tracks, BundleResult | None]:
     """Align the depth images of covisible key frames, adjust the map, and refine every frame against it.
 
     sparse_map : its map is changed; frames : of the recording that it is of, corrected by what is known of the camera
-    iterations : of the adjustment; workers : threads; the result is the same with any number
-    stands_still : when the camera does: the frames of a rest get one pose
+    workers : threads; the result is the same with any number
     Returns the refined tracks, and the evidence of the adjustment, None where nothing ties two key frames together.
     """
+    depth = by.depth
     if depth.most:
         T_cd = rolling_shutter.depth_to_colour(frames.features, depth.timing, sparse_map.kf.frame)
         points = depth.points.under(frames.camera)
         DepthAligner(sparse_map, points, points).join_covisible(T_cd, most=depth.most, least=SHARED, workers=workers)
     kfs = np.arange(len(sparse_map.kf), dtype=np.int32)
-    result = map_adjustment.adjust(sparse_map, kfs, frames.camera, frames.sensor, max_iterations=iterations, edge_weight=depth.weight)
-    tracks = refine_frames(sparse_map, frames, tracks, settings, progress, workers=workers, stands_still=stands_still)
+    result = map_adjustment.adjust(sparse_map, kfs, frames.camera, frames.sensor, max_iterations=by.iterations, edge_weight=depth.weight)
+    tracks = refine_frames(sparse_map, frames, tracks, by.settings, progress, workers=workers, stands_still=by.stands_still)
     return move_key_frames(sparse_map, tracks), result
 
 

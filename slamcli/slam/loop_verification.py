@@ -29,8 +29,7 @@ def verify(
     frame_i, frame_j = (frames[int(sparse_map.kf.frame[kf])] for kf in (candidate.kf_i, candidate.kf_j))
     if candidate.is_by_pose:
         return _find_landmarks(sparse_map, candidate, frame_i, se3.inverse(sparse_map.kf.T_wk[candidate.kf_i]), settings)
-    node_i, node_j = (np.array(words.node[f.first_row : f.first_row + len(f)]) for f in (frame_i, frame_j))
-    rows, _ = hamming.match_nodes(frame_i.desc.view(np.uint8), node_i, frame_j.desc.view(np.uint8), node_j, frame_i.angle, frame_j.angle)
+    rows, _ = hamming.match_nodes(_described(frame_i, words), _described(frame_j, words))
     has_depth = np.isfinite(frame_i.depth[rows[:, 0]]) & np.isfinite(frame_j.depth[rows[:, 1]])
     rows = rows[has_depth]
     candidate = replace(candidate, n_matches=len(rows))
@@ -58,6 +57,11 @@ def find_again(sparse_map: SparseMap, candidate: Candidate, T_iw: np.ndarray, fr
     """Look for the landmarks around key frame j in key frame i, from a guess of its pose T_iw in the world that j stands in."""
     frame_i = frames[int(sparse_map.kf.frame[candidate.kf_i])]
     return _find_landmarks(sparse_map, candidate, frame_i, T_iw, settings)
+
+
+def _described(frame: FrameFeatures, words: Words) -> hamming.Described:
+    node = words.node[frame.first_row : frame.first_row + len(frame)]
+    return hamming.Described(frame.desc.view(np.uint8), frame.angle, node)
 
 
 def _find_landmarks(

@@ -49,13 +49,10 @@ class Relocalizer:
         """Match the frame with the landmarks of a key frame under the same vocabulary nodes; returns its features and the landmarks."""
         there = self._sparse_map.rows_of(kf)
         here = slice(frame.first_row, frame.first_row + len(frame))
+        features = self._sparse_map.features
         match, _ = hamming.match_nodes(
-            frame.desc.view(np.uint8),
-            self._words.node[here],
-            self._sparse_map.features.desc[there],
-            self._places.words.node[there],
-            frame.angle,
-            self._sparse_map.features.angle[there],
+            hamming.Described(frame.desc.view(np.uint8), frame.angle, self._words.node[here]),
+            hamming.Described(features.desc[there], features.angle[there], self._places.words.node[there]),
         )
         ids = self._sparse_map.lm_of_row[there][match[:, 1]]
         return match[ids >= 0, 0], ids[ids >= 0]

@@ -100,10 +100,8 @@ class _Looks:
         in_i, in_j = (slice(int(self.features.offset[frame]), int(self.features.offset[frame + 1])) for frame in (i, j))
         if row is None:
             f, node = self.features, self.words.node
-            row, _ = hamming.match_nodes(
-                f.desc[in_i], node[in_i], f.desc[in_j], node[in_j], f.angle[in_i], f.angle[in_j],
-                max_distance=MAX_DISTANCE, ratio=RATIO, check_rotation=True,
-            )  # fmt: skip
+            here, there = (hamming.Described(f.desc[rows], f.angle[rows], node[rows]) for rows in (in_i, in_j))
+            row, _ = hamming.match_nodes(here, there, max_distance=MAX_DISTANCE, ratio=RATIO)
         xy_i, xy_j = self.features.xy[in_i][row[:, 0]], self.features.xy[in_j][row[:, 1]]
         in_sight = (xy_i[:, 0] > -self.camera.width) & (xy_j[:, 0] > -self.camera.width)
         middle = np.array([self.camera.width, self.camera.height]) / 2.0

@@ -1,24 +1,20 @@
 """The growing map: key frames, landmarks and observations. The only mutable store of the tracker."""
 
 import numpy as np
-from numba import b1, f8, i4, i8, u1, u8
 
 from slamcli.geometry import elementary, se3
-from slamcli.geometry.bits import hamming
-from slamcli.jit.kernel import kernel
 from slamcli.schema import Features, Map
+from slamcli.sparse_map import observation_chains
 from slamcli.sparse_map.guided_matching import Landmarks
+from slamcli.sparse_map.observation_chains import Chains, Fates, FeatureColumns, Looks
 from slamcli.sparse_map.table import Table
-
-# Views beyond the latest add nothing to a landmark's mean direction and would make its medoid quadratic in its life.
-LATEST_VIEWS = 16
 
 
 class SparseMap:
     """Key frames and landmarks with their observations, as flat tables.
 
-    A landmark's observations form a chain through `obs.next`, starting at `lm.head`; -1 ends it. An observation that was removed keeps
-    its place in the chain with `kf` = -1. `lm_of_row` answers the other question: which landmark a feature of a key frame shows.
+    A landmark's observations form a chain (`observation_chains`). `lm_of_row` answers the other question: which landmark a feature of a
+    key frame shows.
     """
 
     def __init__(self, features: Features):
@@ -89,7 +85,7 @@ class SparseMap:
     def observe(self, kf: int, ids: np.ndarray, rows: np.ndarray) -> None:
         """Note that key frame `kf` sees landmarks `ids` (N,) as features `rows` (N,); neither may be in use in `kf` already."""
         added = self.obs.append(len(ids), lm=ids, kf=kf, row=rows, next=-1)
-        _link(self.lm.head, self.lm.n_obs, self.obs.next, self.obs.lm, added.start)
+        observation_chains.link(self._chains(), added.start)
         self.lm_of_row[rows] = ids
 
     def add_edge(self, kf_i: int, kf_j: int, T_ij: np.ndarray, information: np.ndarray) -> None:
@@ -121,13 +117,13 @@ class SparseMap:
     def votes(self, ids: np.ndarray) -> np.ndarray:
         """Count for every key frame (K,) how many of the landmarks `ids` it sees."""
         counts = np.zeros(len(self.kf), dtype=np.int32)
-        _count_views(ids, self.lm.head, self.obs.next, self.obs.kf, counts)
+        observation_chains.count_views(ids, self._chains(), counts)
         return counts
 
     def landmarks_in(self, kfs: np.ndarray) -> np.ndarray:
         """Return the landmarks (N,) that any of the key frames sees, increasing."""
         is_seen, frame = np.zeros(len(self.lm), dtype=np.bool_), self.kf.frame[kfs]
-        _mark(self._offset[frame], self._offset[frame + 1], self.lm_of_row, is_seen)
+        observation_chains.mark(self._offset[frame], self._offset[frame + 1], self.lm_of_row, is_seen)
         return np.flatnonzero(is_seen).astype(np.int32)
 
     def landmarks_of(self, kf: int) -> np.ndarray:
@@ -151,13 +147,13 @@ class SparseMap:
         """Return all observations of landmarks `ids`: index into `ids`, key frame, feature row; sorted by (landmark, key frame)."""
         total = int(self.lm.n_obs[ids].sum())
         which, kf, row = np.empty(total, np.int32), np.empty(total, np.int32), np.empty(total, np.int64)
-        n = _gather(ids, self.lm.head, self.obs.next, self.obs.kf, self.obs.row, which, kf, row)
+        n = observation_chains.gather(ids, self._chains(), which, kf, row)
         assert n == total
         return which, kf, row
 
     def remove_observations(self, rows: np.ndarray) -> None:
         """Forget that the features `rows` (N,) of key frames show their landmarks; a landmark without views dies."""
-        _unlink(rows, self.lm_of_row, self.lm.head, self.lm.n_obs, self.lm.is_alive, self.obs.next, self.obs.kf, self.obs.row)
+        observation_chains.unlink(rows, self.lm_of_row, self.lm.is_alive, self._chains())
 
     def remove_landmarks(self, ids: np.ndarray) -> None:
         """Remove landmarks with all their observations."""
@@ -170,27 +166,15 @@ class SparseMap:
 
         A pair one of which is dead, or died by a fusion before it, is passed over.
         """
-        columns = (self.lm.head, self.lm.n_obs, self.lm.n_visible, self.lm.n_found, self.lm.is_alive, self.lm.replaced_by)
         pairs = (np.ascontiguousarray(ids, dtype=np.int32) for ids in (kept, gone))
-        _fuse(*pairs, self.lm_of_row, *columns, self.obs.next, self.obs.lm, self.obs.kf, self.obs.row)
+        fates = Fates(self.lm.n_visible, self.lm.n_found, self.lm.is_alive, self.lm.replaced_by)
+        observation_chains.fuse(*pairs, self.lm_of_row, fates, self._chains())
 
     def refresh(self, ids: np.ndarray) -> None:
         """Recompute what guided matching needs of landmarks `ids`: descriptor, viewing direction, reach."""
-        _refresh(
-            ids,
-            self.lm.head,
-            self.obs.next,
-            self.obs.kf,
-            self.obs.row,
-            self.lm.xyz,
-            self.kf.T_wk,
-            self.desc,
-            self.octave,
-            self.octave_scale,
-            self.lm.desc,
-            self.lm.direction,
-            self.lm.reach,
-        )
+        features = FeatureColumns(self.desc, self.octave, self.octave_scale)
+        looks = Looks(self.lm.desc, self.lm.direction, self.lm.reach)
+        observation_chains.refresh(ids, self._chains(), self.lm.xyz, self.kf.T_wk, features, looks)
 
     def snapshot(self) -> Map:
         """Return the map as an artefact: living landmarks, renumbered."""
@@ -232,11 +216,14 @@ class SparseMap:
             is_alive=True,
         )
         self.obs.append(len(map_.obs_lm), lm=map_.obs_lm, kf=map_.obs_kf, row=map_.obs_row, next=-1)
-        _link(self.lm.head, self.lm.n_obs, self.obs.next, self.obs.lm, 0)
+        observation_chains.link(self._chains(), 0)
         self.lm_of_row[map_.obs_row] = map_.obs_lm
         self.edge.append(len(map_.edge_kf), kf=map_.edge_kf, T_ij=map_.edge_T_ij, information=map_.edge_information)
         self.refresh(np.arange(n_lm, dtype=np.int32))
         return self
+
+    def _chains(self) -> Chains:
+        return Chains(self.lm.head, self.lm.n_obs, self.obs.next, self.obs.lm, self.obs.kf, self.obs.row)
 
     def centres(self) -> np.ndarray:
         """Return the camera centres (K, 3) of the key frames [m, world]."""
@@ -245,164 +232,3 @@ class SparseMap:
     def T_kw(self, kfs: np.ndarray) -> np.ndarray:
         """Return world-to-camera transforms (N, 4, 4) of key frames."""
         return se3.inverse(self.kf.T_wk[kfs])
-
-
-@kernel
-def _link(head: i4[::1], n_obs: i4[::1], next_: i4[::1], obs_lm: i4[::1], start: i8):
-    for o in range(start, len(obs_lm)):
-        lm = obs_lm[o]
-        next_[o] = head[lm]
-        head[lm] = o
-        n_obs[lm] += 1
-
-
-@kernel
-def _mark(first: i8[::1], last: i8[::1], lm_of_row: i4[::1], is_seen: b1[::1]):
-    """Mark the landmarks that rows `first` to `last` of the features, the last left out, show in each of several key frames."""
-    for k in range(len(first)):
-        for row in range(first[k], last[k]):
-            if lm_of_row[row] >= 0:
-                is_seen[lm_of_row[row]] = True
-
-
-@kernel
-def _count_views(ids: i4[::1], head: i4[::1], next_: i4[::1], obs_kf: i4[::1], counts: i4[::1]):
-    for lm in ids:
-        o = head[lm]
-        while o >= 0:
-            if obs_kf[o] >= 0:
-                counts[obs_kf[o]] += 1
-            o = next_[o]
-
-
-@kernel
-def _gather(ids: i4[::1], head: i4[::1], next_: i4[::1], obs_kf: i4[::1], obs_row: i8[::1], which: i4[::1], kf: i4[::1], row: i8[::1]):
-    """Write the observations of landmarks `ids`, each one's sorted by key frame as they come: most chains nearly are. Returns how many."""
-    n = 0
-    for i in range(len(ids)):
-        first, o = n, head[ids[i]]
-        while o >= 0:
-            if obs_kf[o] >= 0:
-                place = n
-                while place > first and kf[place - 1] > obs_kf[o]:
-                    kf[place], row[place] = kf[place - 1], row[place - 1]
-                    place -= 1
-                which[n], kf[place], row[place] = i, obs_kf[o], obs_row[o]
-                n += 1
-            o = next_[o]
-    return n
-
-
-@kernel
-def _unlink(
-    rows: i8[::1], lm_of_row: i4[::1], head: i4[::1], n_obs: i4[::1], is_alive: b1[::1], next_: i4[::1], obs_kf: i4[::1], obs_row: i8[::1]
-):
-    for row in rows:
-        lm = lm_of_row[row]
-        if lm < 0:
-            continue
-        o = head[lm]
-        while o >= 0:
-            if obs_kf[o] >= 0 and obs_row[o] == row:
-                obs_kf[o] = -1
-                n_obs[lm] -= 1
-                break
-            o = next_[o]
-        lm_of_row[row] = -1
-        if n_obs[lm] == 0:
-            is_alive[lm] = False
-
-
-@kernel
-def _fuse(
-    kept: i4[::1],
-    gone: i4[::1],
-    lm_of_row: i4[::1],
-    head: i4[::1],
-    n_obs: i4[::1],
-    n_visible: i4[::1],
-    n_found: i4[::1],
-    is_alive: b1[::1],
-    replaced_by: i4[::1],
-    next_: i4[::1],
-    obs_lm: i4[::1],
-    obs_kf: i4[::1],
-    obs_row: i8[::1],
-):
-    for pair in range(len(kept)):
-        a, b = kept[pair], gone[pair]
-        if not (is_alive[a] and is_alive[b]):
-            continue
-        o = head[b]
-        while o >= 0:
-            following = next_[o]
-            if obs_kf[o] >= 0:
-                clash = False
-                p = head[a]
-                while p >= 0:
-                    if obs_kf[p] == obs_kf[o]:
-                        clash = True
-                        break
-                    p = next_[p]
-                if clash:
-                    lm_of_row[obs_row[o]] = -1
-                    obs_kf[o] = -1
-                else:
-                    lm_of_row[obs_row[o]] = a
-                    obs_lm[o] = a
-                    next_[o] = head[a]
-                    head[a] = o
-                    n_obs[a] += 1
-            o = following
-        n_visible[a] += n_visible[b]
-        n_found[a] += n_found[b]
-        head[b], n_obs[b], is_alive[b], replaced_by[b] = -1, 0, False, a
-
-
-@kernel
-def _refresh(
-    ids: i4[::1],
-    head: i4[::1],
-    next_: i4[::1],
-    obs_kf: i4[::1],
-    obs_row: i8[::1],
-    xyz: f8[:, ::1],
-    T_wk: f8[:, :, ::1],
-    desc: u8[:, ::1],
-    octave: u1[::1],
-    octave_scale: f8,
-    lm_desc: u8[:, ::1],
-    direction: f8[:, ::1],
-    reach: f8[::1],
-):
-    rows = np.empty(LATEST_VIEWS, dtype=np.int64)
-    for lm in ids:
-        n = 0
-        sx = sy = sz = 0.0
-        nearest = np.inf
-        o = head[lm]
-        while o >= 0 and n < LATEST_VIEWS:
-            if obs_kf[o] >= 0:
-                kf = obs_kf[o]
-                dx, dy, dz = xyz[lm, 0] - T_wk[kf, 0, 3], xyz[lm, 1] - T_wk[kf, 1, 3], xyz[lm, 2] - T_wk[kf, 2, 3]
-                distance = np.sqrt(dx * dx + dy * dy + dz * dz) + 1e-12
-                sx, sy, sz = sx + dx / distance, sy + dy / distance, sz + dz / distance
-                if distance < nearest:
-                    nearest = distance
-                    reach[lm] = distance * elementary.whole_power(octave_scale, octave[obs_row[o]])
-                rows[n] = obs_row[o]
-                n += 1
-            o = next_[o]
-        if n == 0:
-            continue
-        norm = np.sqrt(sx * sx + sy * sy + sz * sz) + 1e-12
-        direction[lm, 0], direction[lm, 1], direction[lm, 2] = sx / norm, sy / norm, sz / norm
-        best, best_sum = rows[0], 1 << 30
-        for a in range(n):  # medoid: the descriptor nearest to all others
-            total = 0
-            for b in range(n):
-                total += int(hamming(desc, rows[a], desc, rows[b]))
-            if total < best_sum:
-                best, best_sum = rows[a], total
-        for i in range(4):
-            lm_desc[lm, i] = desc[best, i]

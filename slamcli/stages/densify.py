@@ -1,6 +1,6 @@
 """densify: the key frames' depth images to one coloured cloud in the level frame."""
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -9,16 +9,13 @@ import numpy as np
 
 from slamcli.artifacts import save
 from slamcli.config.options import Config, DensifyConfig, SensorConfig
-from slamcli.datasets import Dataset
 from slamcli.dense import exposure, voxel_cloud
 from slamcli.depth import noise_model, oriented_points
 from slamcli.formats.cloud import write_ply, write_ply_mesh
 from slamcli.geometry.camera import Camera
 from slamcli.navigation import floor
-from slamcli.schema import Moving
 from slamcli.stages.contract import Inputs, Summary, Tools
-from slamcli.stages.depth_frames import PosedFrame, depth_poses, read_depth
-from slamcli.stages.moving_parts import NOTHING
+from slamcli.stages.depth_frames import DepthFrames, PosedFrame, depth_poses, say_nothing
 
 SAMPLES_APART = 0.75  # voxels from sample to sample of a near surface: denser ones gain nothing
 FIRST_CAMERA = np.eye(4)  # the world is its frame; the level frame's origin is below it
@@ -28,22 +25,17 @@ GROUND_FRAMES = 40  # key frames, evenly spread, that are searched for the floor
 
 def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
     """Find the floor, join the key frames' depth, write `cloud.ply` (and `mesh.ply` where a surface was made) in the floor's frame."""
-    camera, option = inputs.camera("loop"), cfg.densify
-    poses = depth_poses(inputs)
-    model_w, moving = _model(camera, option), inputs.load(Moving, "loop")
-    colours = (
-        find_colours(inputs.dataset, camera, tools.progress(poses, "colours"), cfg.sensor, option, moving=moving, workers=tools.workers)
-        if option.even_colours
-        else AS_RECORDED
-    )
+    option, depths, poses = cfg.densify, DepthFrames.of(inputs, tools), depth_poses(inputs)
+    camera = depths.camera
+    model_w = _model(camera, option)
+    colours = find_colours(depths, tools.progress(poses, "colours"), cfg.sensor, option) if option.even_colours else AS_RECORDED
     n_used = 0
 
     def frames() -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """Hand some of the depth images on to the search for the floor, so that they are decoded once."""
         nonlocal n_used
         every = -(-len(poses) // GROUND_FRAMES)
-        timeline = tools.progress(poses, "densify")
-        for view in views(inputs.dataset, camera, timeline, cfg.sensor, option, moving=moving, workers=tools.workers, warn=tools.warn):
+        for view in views(depths, tools.progress(poses, "densify"), cfg.sensor, option):
             model_w.add(view.seen, view.evened(colours), view.T_wk)
             n_used += 1
             if n_used % every == 0:
@@ -108,47 +100,28 @@ class View:
         return self.rgb if gain is None else exposure.evened(self.rgb, gain, colours.shading)
 
 
-def find_colours(
-    dataset: Dataset,
-    camera: Camera,
-    poses: Iterable[PosedFrame],
-    sensor: SensorConfig,
-    option: DensifyConfig,
-    *,
-    moving: Moving = NOTHING,
-    workers: int = 1,
-) -> Colours:
-    """Find what evens out the key frames' colours; frames that cannot be read have no gain."""
+def find_colours(depths: DepthFrames, poses: Iterable[PosedFrame], sensor: SensorConfig, option: DensifyConfig) -> Colours:
+    """Find what evens out the key frames' colours; frames that cannot be read have no gain, and are told of when they are joined."""
     coarse = replace(option, method="voxel", stride=COLOUR_STRIDE)
     frame: list[int] = []
 
     def seen() -> Iterator[tuple[oriented_points.Surface, np.ndarray, np.ndarray]]:
-        for view in views(dataset, camera, poses, sensor, coarse, moving=moving, workers=workers):
+        for view in views(replace(depths, warn=say_nothing), poses, sensor, coarse):
             frame.append(view.frame)
             yield view.seen, view.rgb, view.T_wk
 
     found = exposure.fit_evening(seen())
-    return Colours(dict(zip(frame, found.gain, strict=True)), found.shading(camera.height, camera.width))
+    return Colours(dict(zip(frame, found.gain, strict=True)), found.shading(depths.camera.height, depths.camera.width))
 
 
-def views(
-    dataset: Dataset,
-    camera: Camera,
-    poses: Iterable[PosedFrame],
-    sensor: SensorConfig,
-    option: DensifyConfig,
-    *,
-    moving: Moving = NOTHING,
-    workers: int = 1,
-    warn: Callable[[str], None] = lambda message: None,
-) -> Iterator[View]:
+def views(depths: DepthFrames, poses: Iterable[PosedFrame], sensor: SensorConfig, option: DensifyConfig) -> Iterator[View]:
     """Read and clean frames, in order, without what moves; one without depth, or that cannot be read, gives no view."""
     is_volume = option.method == "tsdf"
 
     def look(frame: int, depth: np.ndarray, T_wk: np.ndarray) -> View:
         seen = oriented_points.surface(
             depth,
-            camera,
+            depths.camera,
             settings=option,
             noise=noise_model.reading_noise(sensor),
             stride=1 if is_volume else option.stride,
@@ -156,6 +129,6 @@ def views(
             depth_min=sensor.depth_min,
             depth_max=min(sensor.depth_max, option.depth_max),
         )
-        return View(frame, T_wk, depth, seen, dataset.rgb(frame))
+        return View(frame, T_wk, depth, seen, depths.dataset.rgb(frame))
 
-    return read_depth(dataset, camera, poses, look, moving=moving, workers=workers, warn=warn)
+    return depths.look_at(poses, look)

@@ -1,6 +1,7 @@
 """Depth images with the poses of the camera that took them: what densify, octree and grid2d are made from."""
 
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
@@ -11,7 +12,7 @@ from slamcli.errors import BadFrame
 from slamcli.geometry.camera import Camera
 from slamcli.parallel import ordered_map
 from slamcli.schema import FrameTimes, Map, Moving, Tracks, frame_poses
-from slamcli.stages.contract import Stored
+from slamcli.stages.contract import Inputs, Stored, Tools
 from slamcli.stages.measurements import depth_times
 from slamcli.stages.moving_parts import NOTHING, still_depth
 
@@ -33,28 +34,38 @@ def depth_poses(inputs: Stored, *, frames: str = "key") -> list[PosedFrame]:
     return [(int(frame), T_wd[frame]) for frame in chosen]
 
 
-def read_depth(
-    dataset: Dataset,
-    camera: Camera,
-    poses: Iterable[PosedFrame],
-    look: Callable[[int, np.ndarray, np.ndarray], Seen],
-    *,
-    moving: Moving = NOTHING,
-    workers: int = 1,
-    warn: Callable[[str], None] = lambda message: None,
-) -> Iterator[Seen]:
-    """Read frames' depth images, in order, and hand each to `look(frame, depth, pose)` in a worker thread; yields what that returns.
+def say_nothing(message: str) -> None:
+    """Pass over what there is to warn of."""
 
-    depth : (H, W) float32 [m], NaN = none and where something moves. A frame without depth, or that cannot be read, yields nothing; `warn` is told of the latter.
-    """
 
-    def seen(posed: PosedFrame) -> Seen | None:
-        frame, pose = posed
-        try:
-            depth = dataset.depth(frame, camera)
-            return None if depth is None else look(frame, still_depth(depth, moving, frame, camera), pose)
-        except BadFrame as error:
-            warn(str(error))
-            return None
+@dataclass(frozen=True)
+class DepthFrames:
+    """A recording's depth images as the maps are made from them: undistorted, without what moves."""
 
-    return (found for found in ordered_map(seen, poses, workers=workers) if found is not None)
+    dataset: Dataset
+    camera: Camera
+    moving: Moving = NOTHING
+    workers: int = 1  # threads that read
+    warn: Callable[[str], None] = say_nothing  # told of frames that cannot be read
+
+    @classmethod
+    def of(cls, inputs: Inputs, tools: Tools) -> "DepthFrames":
+        """Return those of the recording that a stage works on, as loop left its camera and what moves."""
+        return cls(inputs.dataset, inputs.camera("loop"), inputs.load(Moving, "loop"), tools.workers, tools.warn)
+
+    def look_at(self, poses: Iterable[PosedFrame], look: Callable[[int, np.ndarray, np.ndarray], Seen]) -> Iterator[Seen]:
+        """Read frames, in order, and hand each to `look(frame, depth, pose)` in a worker thread; yields what that returns.
+
+        depth : (H, W) float32 [m], NaN = none and where something moves. A frame without depth, or that cannot be read, yields nothing.
+        """
+
+        def seen(posed: PosedFrame) -> Seen | None:
+            frame, pose = posed
+            try:
+                depth = self.dataset.depth(frame, self.camera)
+                return None if depth is None else look(frame, still_depth(depth, self.moving, frame, self.camera), pose)
+            except BadFrame as error:
+                self.warn(str(error))
+                return None
+
+        return (found for found in ordered_map(seen, poses, workers=self.workers) if found is not None)

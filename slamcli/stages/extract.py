@@ -102,7 +102,7 @@ def _extract(dataset: Dataset, settings: ExtractConfig, i: int) -> Frame:
         grey = dataset.grey(i)
     except BadFrame as error:
         return Frame(orb.no_key_points(), np.zeros(0, np.float32), np.zeros((0, 2), np.float32), None, [str(error)])
-    points = detect(grey, settings)
+    points = orb.detect(grey, settings)
     try:
         depth = dataset.depth(i)
     except BadFrame as error:
@@ -123,24 +123,6 @@ def _counts(dataset: Dataset, depth: np.ndarray, i: int) -> np.ndarray | None:
     if i not in spread(len(dataset), COUNTED):
         return None
     return depth_unit.counted_metres(depth, depth_unit.counting_scale(dataset.camera.depth_scale))
-
-
-def detect(grey: np.ndarray, settings: ExtractConfig) -> orb.KeyPoints:
-    """Find the key points of a grey image (H, W) uint8 under these settings."""
-    return orb.detect(
-        grey,
-        features=settings.features,
-        levels=settings.levels,
-        scale=settings.scale,
-        cell=settings.cell,
-        threshold=settings.fast_threshold,
-        threshold_low=settings.fast_threshold_low,
-        smooth=settings.smooth,
-        pool=settings.pool,
-        weak=settings.weak,
-        rank_by=settings.rank_by,
-        subpixel=settings.subpixel,
-    )
 
 
 def _table(dataset: Dataset, camera: Camera, found: list[Frame], scale: float) -> Features:

@@ -18,9 +18,9 @@ from slamcli.navigation.driven import mark_driven
 from slamcli.navigation.grid_evidence import View, look
 from slamcli.navigation.robot_pose import planar_pose
 from slamcli.navigation.terrain import Terrain
-from slamcli.schema import FrameTimes, Grid, Ground, Map, Moving, Tracks, frame_poses
+from slamcli.schema import FrameTimes, Grid, Ground, Map, Tracks, frame_poses
 from slamcli.stages.contract import Inputs, Summary, Tools
-from slamcli.stages.depth_frames import PosedFrame, depth_poses, read_depth
+from slamcli.stages.depth_frames import DepthFrames, PosedFrame, depth_poses
 from slamcli.stages.moving_parts import coarse_images
 
 BODY_VIEWS = 60  # spread over the drive, in which the robot's own body is looked for
@@ -53,8 +53,8 @@ def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
 
 
 def _from_depth(inputs: Inputs, T_lw: np.ndarray, cfg: Config, tools: Tools) -> tuple[Grid, int]:
-    option, camera, moving = cfg.grid2d, inputs.camera("loop"), inputs.load(Moving, "loop")
-    rays = np.ascontiguousarray(camera.rays)
+    option, depths = cfg.grid2d, DepthFrames.of(inputs, tools)
+    rays = np.ascontiguousarray(depths.camera.rays)
     has_depth = np.isfinite(inputs.load(FrameTimes, "loop").depth_stamp)
     poses = [(frame, product(T_lw, T_wd)) for frame, T_wd in depth_poses(inputs, frames="all") if has_depth[frame]]
     chosen = grid.spaced(np.array([T_ld for _, T_ld in poses]).reshape(-1, 4, 4), metres=option.spacing, degrees=option.spacing_deg)
@@ -74,7 +74,7 @@ def _from_depth(inputs: Inputs, T_lw: np.ndarray, cfg: Config, tools: Tools) -> 
             return look(depth, rays, T_ld, settings=option, sensor=cfg.sensor, floor=floor)
 
         spaced = tools.progress([poses[row] for row in chosen.tolist()], "grid2d")
-        for view in read_depth(inputs.dataset, camera, spaced, look_at, moving=moving, workers=tools.workers, warn=tools.warn):
+        for view in depths.look_at(spaced, look_at):
             n_views += 1
             yield view
 

@@ -16,7 +16,7 @@ from slamcli.schema import LOST, Closures, DepthTimes, FrameTimes, Map, Moving, 
 from slamcli.slam import doubt, final_refinement, loop_pose_graph, map_segments, pose_doubt
 from slamcli.slam.common_place import Jury
 from slamcli.slam.depth_tracking import FramePoints
-from slamcli.slam.final_refinement import DepthEdges
+from slamcli.slam.final_refinement import DepthEdges, Refinement
 from slamcli.slam.loop_candidates import Candidate
 from slamcli.slam.loop_closing import LoopCloser, no_objection
 from slamcli.slam.moving_objects import FOR_MAPS
@@ -92,17 +92,8 @@ def look_again(
     inputs: Inputs, sparse_map: SparseMap, frames: FrameStore, tracks: Tracks, depth: DepthEdges, cfg: Config, tools: Tools
 ) -> Tracks:
     """Refine the whole map and every frame, now that places seen again coincide."""
-    refined, _ = final_refinement.refine_all(
-        sparse_map,
-        frames,
-        tracks,
-        cfg.track,
-        depth=depth,
-        iterations=cfg.loop.iterations,
-        progress=tools.progress,
-        workers=tools.workers,
-        stands_still=inputs.load(Rests, "track"),
-    )
+    by = Refinement(cfg.track, depth, cfg.loop.iterations, inputs.load(Rests, "track"))
+    refined, _ = final_refinement.refine_all(sparse_map, frames, tracks, by, progress=tools.progress, workers=tools.workers)
     return refined
 
 

@@ -58,10 +58,6 @@ def _match(features: Features, words: Words, flowed: np.ndarray, settings: Match
 def _match_descriptors(features: Features, words: Words, settings: MatchConfig, pair: tuple[int, int]) -> np.ndarray:
     i, j = (slice(int(features.offset[frame]), int(features.offset[frame + 1])) for frame in pair)
     checks: Any = {"max_distance": settings.max_distance, "ratio": settings.ratio, "check_rotation": settings.check_rotation}
-    if settings.method == "brute":
-        rows, _ = hamming.match_brute(features.desc[i], features.desc[j], features.angle[i], features.angle[j], **checks)
-    else:
-        rows, _ = hamming.match_nodes(
-            features.desc[i], words.node[i], features.desc[j], words.node[j], features.angle[i], features.angle[j], **checks
-        )
-    return rows
+    here, there = (hamming.Described(features.desc[rows], features.angle[rows], words.node[rows]) for rows in (i, j))
+    matched, _ = (hamming.match_brute if settings.method == "brute" else hamming.match_nodes)(here, there, **checks)
+    return matched

@@ -1,23 +1,20 @@
 """octree: depth images to occupied and free space in the level frame."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
 
 from slamcli.config.options import Config, OctreeConfig, SensorConfig
-from slamcli.datasets import Dataset
 from slamcli.dense import change_detection
 from slamcli.dense.occupancy import OccupancyMap, Scan
 from slamcli.depth import noise_model, oriented_points
 from slamcli.formats import octomap
 from slamcli.geometry import octree, se3
 from slamcli.geometry.algebra import product
-from slamcli.geometry.camera import Camera
-from slamcli.schema import Ground, Moving
+from slamcli.schema import Ground
 from slamcli.stages.contract import Inputs, Summary, Tools
-from slamcli.stages.depth_frames import PosedFrame, depth_poses, read_depth
-from slamcli.stages.moving_parts import NOTHING
+from slamcli.stages.depth_frames import DepthFrames, PosedFrame, depth_poses
 
 RAYS_APART = 0.3  # cells from end point to end point on a near surface
 ROUNDS = 2  # of asking the frames between: something may stand before what the first were asked about
@@ -25,12 +22,11 @@ ROUNDS = 2  # of asking the frames between: something may stand before what the 
 
 def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
     """Insert depth images as scans, write `map.ot` and `map.bt`."""
-    option, moving, camera = cfg.octree, inputs.load(Moving, "loop"), inputs.camera("loop")
+    option, depths = cfg.octree, DepthFrames.of(inputs, tools)
     grid = OccupancyMap(option.resolution, hit=option.hit, miss=option.miss, clamp_min=option.clamp_min, clamp_max=option.clamp_max)
     n_scans = 0
     for poses in rounds(inputs, grid, option):
-        progress = tools.progress(poses, "octree")
-        for scan in scans(inputs.dataset, camera, progress, cfg.sensor, option, moving=moving, workers=tools.workers, warn=tools.warn):
+        for scan in scans(depths, tools.progress(poses, "octree"), cfg.sensor, option):
             grid.insert(scan.x, scan.origin, max_range=option.max_range, frame=scan.frame)
             n_scans += 1
     cells = grid.leaves()
@@ -67,17 +63,7 @@ def rounds(inputs: Inputs, grid: OccupancyMap, option: OctreeConfig) -> Iterator
         yield asked
 
 
-def scans(
-    dataset: Dataset,
-    camera: Camera,
-    poses: Iterable[PosedFrame],
-    sensor: SensorConfig,
-    option: OctreeConfig,
-    *,
-    moving: Moving = NOTHING,
-    workers: int = 1,
-    warn: Callable[[str], None] = lambda message: None,
-) -> Iterator[Scan]:
+def scans(depths: DepthFrames, poses: Iterable[PosedFrame], sensor: SensorConfig, option: OctreeConfig) -> Iterator[Scan]:
     """Read frames' depth, cleaned and without what moves, as scans in the frame that the poses lead to.
 
     poses : (frame, camera to that frame when its depth was measured); one without depth, or that cannot be read, gives no scan
@@ -86,7 +72,7 @@ def scans(
     def look(frame: int, depth: np.ndarray, T_lk: np.ndarray) -> Scan:
         seen = oriented_points.surface(
             depth,
-            camera,
+            depths.camera,
             settings=option,
             noise=noise_model.reading_noise(sensor),
             stride=option.stride,
@@ -96,4 +82,4 @@ def scans(
         )
         return Scan(se3.transform(T_lk, seen.xyz_c.astype(np.float64)), T_lk[:3, 3], frame)
 
-    return read_depth(dataset, camera, poses, look, moving=moving, workers=workers, warn=warn)
+    return depths.look_at(poses, look)

@@ -1,6 +1,6 @@
 """optimize: the whole map is adjusted at once, and with it what is not known of the camera; then every frame is refined against the map."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ from slamcli.config.options import Config
 from slamcli.schema import Features, FrameTimes, Map, Moving, Rests, Timing, Tracks
 from slamcli.slam import calibration_doubt, doubt, final_refinement, map_segments, rests
 from slamcli.slam.depth_tracking import NO_FRAME_POINTS, FramePoints
-from slamcli.slam.final_refinement import DepthEdges
+from slamcli.slam.final_refinement import DepthEdges, Refinement
 from slamcli.sparse_map import map_adjustment
 from slamcli.sparse_map.frame import FrameStore
 from slamcli.sparse_map.sparse_map import SparseMap
@@ -33,10 +33,8 @@ def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
     sensing, summary = Sensing(given, still, {}), dict[str, Any]()
     if cfg.optimize.enabled and len(map_.kf_frame) > 1:
         sparse_map = SparseMap.from_map(features, map_)
-        frame_points = FramePoints(depth, given, cfg.sensor)
-        tracks, sensing, summary = refine(
-            sparse_map, features, tracks, sensing, cfg, tools, frame_points=frame_points, stands_still=inputs.load(Rests, "track")
-        )
+        extracted = Extracted(features, FramePoints(depth, given, cfg.sensor), inputs.load(Rests, "track"))
+        tracks, sensing, summary = refine(sparse_map, extracted, tracks, sensing, cfg, tools)
         doubts = calibration_doubt.judge(sparse_map, sensing, cfg.sensor)
         for one in doubts:
             tools.warn(one.text)
@@ -48,22 +46,24 @@ def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
     return {"frames": len(features.stamp), "key_frames": len(map_.kf_frame)} | figures(sensing) | summary
 
 
+@dataclass(frozen=True)
+class Extracted:
+    """What extract measured of a recording, under the calibration that it was given, and what track found out of it."""
+
+    features: Features
+    points: FramePoints = NO_FRAME_POINTS
+    stands_still: Rests = rests.NONE
+
+
 def refine(
-    sparse_map: SparseMap,
-    features: Features,
-    tracks: Tracks,
-    sensing: Sensing,
-    cfg: Config,
-    tools: Tools,
-    *,
-    frame_points: FramePoints = NO_FRAME_POINTS,
-    stands_still: Rests = rests.NONE,
+    sparse_map: SparseMap, extracted: Extracted, tracks: Tracks, sensing: Sensing, cfg: Config, tools: Tools
 ) -> tuple[Tracks, Sensing, dict]:
     """Adjust the map, find what of the camera suits it, and again; returns tracks, what was found, and the evidence.
 
     sensing : what is known of the camera before. The motion in it comes from poses, the poses from features that it corrected: two
     rounds bring both to rest.
     """
+    features = extracted.features
     kfs, given, cost = np.arange(len(sparse_map.kf), dtype=np.int32), sensing.camera, []
     prior = self_calibration.unknowns(given, cfg.optimize)
     for _ in range(cfg.optimize.rounds if prior else 0):
@@ -76,17 +76,10 @@ def refine(
         sensing = replace(found, timing=replace(found.timing, twist=twist))
         cost.append(result.cost[-1])
     sparse_map.features = self_calibration.correct(features, given, sensing)
-    tracks, result = final_refinement.refine_all(
-        sparse_map,
-        FrameStore(sparse_map.features, sensing.camera, cfg.sensor),
-        tracks,
-        cfg.track,
-        depth=DepthEdges(frame_points, sensing.timing, most=cfg.optimize.depth_icp_edges),
-        iterations=cfg.optimize.iterations,
-        progress=tools.progress,
-        workers=tools.workers,
-        stands_still=stands_still,
-    )
+    frames = FrameStore(sparse_map.features, sensing.camera, cfg.sensor)
+    depth = DepthEdges(extracted.points, sensing.timing, most=cfg.optimize.depth_icp_edges)
+    by = Refinement(cfg.track, depth, cfg.optimize.iterations, extracted.stands_still)
+    tracks, result = final_refinement.refine_all(sparse_map, frames, tracks, by, progress=tools.progress, workers=tools.workers)
     summary = {} if result is None else {"cost": [*cost, result.cost[-1]], "outliers": int((~result.is_inlier).sum())}
     return tracks, sensing, summary
 

@@ -1,5 +1,7 @@
 """Matching of binary descriptors by Hamming distance: all with all, or only those under one vocabulary node."""
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import f4, f8, i4, i8, u4, u8, uint32, uintp
 
@@ -130,46 +132,57 @@ def as_words(desc: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(desc, dtype=np.uint8).reshape(-1, 32).view(np.uint64)
 
 
-def match_brute(
-    desc_i: np.ndarray, desc_j: np.ndarray, angle_i: np.ndarray, angle_j: np.ndarray,
-    *, max_distance: int = 64, ratio: float = 0.8, check_rotation: bool = True,
-) -> Match:  # fmt: skip
+class Described(NamedTuple):
+    """The features of one frame, as matching takes them."""
+
+    desc: np.ndarray  # (N, 32) uint8
+    angle: np.ndarray  # (N,) [rad]
+    node: np.ndarray | None = None  # (N,), or (N, 2) where the second is the node a descriptor nearly fell under, -1 = none
+
+
+def match_brute(i: Described, j: Described, *, max_distance: int = 64, ratio: float = 0.8, check_rotation: bool = True) -> Match:
     """Match two sets of descriptors by comparing all with all.
 
-    desc : (N, 32) uint8; angle : (N,) [rad]
     max_distance [bits]; ratio : the nearest must be closer than this share of the second nearest's distance
     check_rotation : keep only matches whose turn agrees with most, see `_keep_agreeing`
     Returns rows (Q, 2) int32, increasing in the first column, and distances (Q,) uint8. Each is the other's nearest.
     """
-    block = np.empty((len(desc_i), 1, 2), dtype=np.int32)
-    block[:] = 0, len(desc_j)
-    row_of_entry, entries = np.arange(len(desc_j), dtype=np.int32), np.ascontiguousarray(as_words(desc_j).T)
-    return _match(desc_i, block, entries, row_of_entry, angle_i, angle_j, max_distance, ratio, check_rotation)
+    block = np.empty((len(i.desc), 1, 2), dtype=np.int32)
+    block[:] = 0, len(j.desc)
+    compared = Compared(block, np.ascontiguousarray(as_words(j.desc).T), np.arange(len(j.desc), dtype=np.int32))
+    return _match(i, j, compared, max_distance, ratio, check_rotation)
 
 
-def match_nodes(
-    desc_i: np.ndarray, node_i: np.ndarray, desc_j: np.ndarray, node_j: np.ndarray, angle_i: np.ndarray, angle_j: np.ndarray,
-    *, max_distance: int = 64, ratio: float = 0.8, check_rotation: bool = True,
-) -> Match:  # fmt: skip
+def match_nodes(i: Described, j: Described, *, max_distance: int = 64, ratio: float = 0.8, check_rotation: bool = True) -> Match:
     """Match as `match_brute` does, comparing only descriptors with a vocabulary node in common.
 
-    node : (N,) int32, or (N, 2) where the second is the node a descriptor nearly fell under, -1 for none. Then two are compared where
-    one's first is the other's first or second. The ratio is tightened by NODE_RATIO.
+    Two are compared where one's first node is the other's first or second. The ratio is tightened by NODE_RATIO.
     """
-    node_i, node_j = _two_nodes(node_i), _two_nodes(node_j)
-    if (len(node_i), len(node_j)) != (len(desc_i), len(desc_j)) or min(node_i[:, 0].min(initial=0), node_j[:, 0].min(initial=0)) < 0:
-        raise ValueError("each descriptor needs a node")
+    node_i, node_j = _two_nodes(i), _two_nodes(j)
     n_nodes = 1 + max(int(node_i.max(initial=0)), int(node_j.max(initial=0)))
     block = np.zeros((len(node_i), 2, 2), dtype=np.int32)
     row_of_entry, entries = np.empty(node_j.size, dtype=np.int32), np.empty((4, node_j.size), dtype=np.uint64)
-    n = _group(node_i, node_j, as_words(desc_j), np.zeros(2 * n_nodes + 2, dtype=np.int32), block, row_of_entry, entries)
-    return _match(desc_i, block, entries, row_of_entry[:n], angle_i, angle_j, max_distance, ratio * NODE_RATIO, check_rotation)
+    n = _group(node_i, node_j, as_words(j.desc), np.zeros(2 * n_nodes + 2, dtype=np.int32), block, row_of_entry, entries)
+    return _match(i, j, Compared(block, entries, row_of_entry[:n]), max_distance, ratio * NODE_RATIO, check_rotation)
 
 
-def _two_nodes(node: np.ndarray) -> np.ndarray:
-    """Return nodes (N, 2) int32 from (N,) or (N, 2); -1 stands for no second."""
-    node = np.ascontiguousarray(node, dtype=np.int32)
-    return node if node.ndim == 2 else np.stack([node, np.full_like(node, -1)], axis=1)
+class Compared(NamedTuple):
+    """Which descriptors of frame j each of frame i is compared with."""
+
+    block: np.ndarray  # (N, B, 2) int32, start and stop of entries
+    entries: np.ndarray  # (4, E) uint64, descriptors of j
+    row_of_entry: np.ndarray  # (E,) int32
+
+
+def _two_nodes(features: Described) -> np.ndarray:
+    """Return nodes (N, 2) int32; -1 stands for no second."""
+    if features.node is None or len(features.node) != len(features.desc):
+        raise ValueError("each descriptor needs a node")
+    node = np.ascontiguousarray(features.node, dtype=np.int32)
+    node = node if node.ndim == 2 else np.stack([node, np.full_like(node, -1)], axis=1)
+    if node[:, 0].min(initial=0) < 0:
+        raise ValueError("each descriptor needs a node")
+    return node
 
 
 @kernel
@@ -202,8 +215,9 @@ def _keep_agreeing(rows: i4[:, ::1], angle_i: f4[::1], angle_j: f4[::1]):
     return n
 
 
-def _match(desc_i, block, entries, row_of_entry, angle_i, angle_j, max_distance, ratio, check_rotation) -> Match:
-    words_i, n_i, n_j = as_words(desc_i), len(angle_i), len(angle_j)
+def _match(i: Described, j: Described, compared: Compared, max_distance: int, ratio: float, check_rotation: bool) -> Match:
+    block, entries, row_of_entry = compared
+    words_i, n_i, n_j = as_words(i.desc), len(i.angle), len(j.angle)
     if len(words_i) != n_i or row_of_entry.max(initial=-1) >= n_j:
         raise ValueError("each descriptor needs an angle")
     if max(n_i, len(row_of_entry)) >> INDEX_BITS:
@@ -215,6 +229,6 @@ def _match(desc_i, block, entries, row_of_entry, angle_i, angle_j, max_distance,
     rows = rows[: _accept(best, following, choice, back, row_of_entry, back_of_row, min(int(max_distance), FAR - 1), float(ratio), rows)]
     if check_rotation:
         rows = rows[
-            : _keep_agreeing(rows, np.ascontiguousarray(angle_i, dtype=np.float32), np.ascontiguousarray(angle_j, dtype=np.float32))
+            : _keep_agreeing(rows, np.ascontiguousarray(i.angle, dtype=np.float32), np.ascontiguousarray(j.angle, dtype=np.float32))
         ]
     return rows, best[rows[:, 0]].astype(np.uint8)

@@ -10,11 +10,13 @@ from itertools import accumulate
 
 import numpy as np
 
+from slamcli.config.options import ExtractConfig
 from slamcli.errors import SlamError
 from slamcli.vision import brief, fast, filters, pyramid, quadtree
 
 MIN_SIDE = 2 * brief.BORDER + 1  # [px] of a level that can hold a key point
 MAX_SIDE = 16384  # [px]
+DEFAULTS = ExtractConfig()
 
 
 @dataclass(frozen=True)
@@ -33,51 +35,38 @@ class KeyPoints:
 
 def detect(
     grey: np.ndarray,
-    *,
-    features: int = 1000,
-    levels: int = 8,
-    scale: float = 1.2,
-    cell: int = 30,
-    threshold: int = 8,
-    threshold_low: int = 5,
-    smooth: bool = True,
-    pool: float = 1.3,
-    weak: float = 0.13,
-    rank_by: str = "fast",
-    subpixel: bool = True,
+    settings: ExtractConfig = DEFAULTS,
 ) -> KeyPoints:
-    """Find at most `features` key points of a grey image (H, W) uint8, spread over image and levels.
+    """Find at most `settings.features` key points of a grey image (H, W) uint8, spread over image and levels.
 
-    levels, scale : of the pyramid; cell [px] : side of the cells in which FAST falls back from `threshold` to `threshold_low` [grey levels]
-    smooth : seek corners in a slightly blurred copy; pool : corners kept for each key point wanted, 0 : all
-    weak, rank_by : see `fast.Finder.corners`
-    subpixel : move each point to the summit of the FAST score around it
     An image too small for one key point gives none. Raises SlamError where the array is no 8-bit grey image.
     """
     grey = _checked(grey)
-    space = _space(grey.shape, levels, scale)
+    space = _space(grey.shape, settings.levels, settings.scale)
     box = space.box
     if len(box) == 0:
         return no_key_points()
     pyramid.fill(space.levels, grey)
-    if smooth:
+    if settings.smooth:
         filters.blur_1px(space.image, box, space.blurred)
     corners = space.finder.corners(
-        space.blurred if smooth else space.image,
-        cell=cell,
-        threshold=threshold,
-        threshold_low=threshold_low,
-        at_most=np.array([max(round(pool * features * area / space.area), 1) if pool else 0 for area in space.areas]),
-        weak=weak,
-        rank_by=rank_by,
+        space.blurred if settings.smooth else space.image,
+        cell=settings.cell,
+        threshold=settings.fast_threshold,
+        threshold_low=settings.fast_threshold_low,
+        at_most=np.array(
+            [max(round(settings.pool * settings.features * area / space.area), 1) if settings.pool else 0 for area in space.areas]
+        ),
+        weak=settings.weak,
+        rank_by=settings.rank_by,
     )
-    wanted = shares(features, space.areas, np.diff(corners.first).tolist())
+    wanted = shares(settings.features, space.areas, np.diff(corners.first).tolist())
     rows, octave = quadtree.choose(corners.xy, corners.response, corners.first, space.roots, wanted)
     xy = corners.xy.take(rows, axis=0)
     angle = brief.orientation(space.image, xy)
     filters.blur_2px(space.image, box, space.blurred)
     return KeyPoints(
-        xy=space.full_size(corners.summits(rows) if subpixel else xy.astype(np.float64), octave),
+        xy=space.full_size(corners.summits(rows) if settings.subpixel else xy.astype(np.float64), octave),
         octave=octave,
         angle=angle,
         response=corners.response.take(rows),

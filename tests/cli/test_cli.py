@@ -39,8 +39,8 @@ def fake(here: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         made.name = Path(target).name
         return made
 
+    monkeypatch.setattr("slamcli.inspection.quick_look", lambda dataset: [])  # a fake has no images; loads what keeps the true open_dataset
     monkeypatch.setattr(datasets, "open_dataset", open_dataset)
-    monkeypatch.setattr("slamcli.inspection.quick_look", lambda dataset: [])  # a fake has no images
     for name in ("desk", "room"):
         (here / "recordings" / name).mkdir(parents=True)
     return here

@@ -38,7 +38,7 @@ BOTH = squares(at=[(60, 60)], contrast=120) + squares(at=[(100, 60), (60, 100), 
 
 
 def detect(grey: np.ndarray, **settings) -> orb.KeyPoints:
-    return extract.detect(grey, ExtractConfig(**settings))
+    return orb.detect(grey, ExtractConfig(**settings))
 
 
 def near(points: orb.KeyPoints, u: int, v: int) -> int:

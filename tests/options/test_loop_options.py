@@ -236,12 +236,12 @@ class Lap(Run):
 
 
 @pytest.fixture
-def refined(monkeypatch: pytest.MonkeyPatch) -> list[dict]:
+def refined(monkeypatch: pytest.MonkeyPatch) -> list[final_refinement.Refinement]:
     """Note what the second look at everything is asked for, instead of taking it."""
-    asked: list[dict] = []
+    asked: list[final_refinement.Refinement] = []
 
-    def refine_all(sparse_map, frames, tracks, *_, **options):
-        asked.append(options)
+    def refine_all(sparse_map, frames, tracks, by, **_):
+        asked.append(by)
         return tracks, None
 
     monkeypatch.setattr(final_refinement, "refine_all", refine_all)
@@ -249,7 +249,7 @@ def refined(monkeypatch: pytest.MonkeyPatch) -> list[dict]:
 
 
 @pytest.mark.shows("loop.enabled", "loop.final_refinement", "loop.depth_icp_edges", "loop.depth_icp_weight")
-def test_loops_are_closed_and_looked_at_again_as_asked(scene: Scene, tmp_path: Path, refined: list[dict]) -> None:
+def test_loops_are_closed_and_looked_at_again_as_asked(scene: Scene, tmp_path: Path, refined: list[final_refinement.Refinement]) -> None:
     for name, options, is_closed, n_looks in (
         ("off", {"enabled": False}, False, 0),
         ("once", {"final_refinement": False}, True, 0),
@@ -260,7 +260,7 @@ def test_loops_are_closed_and_looked_at_again_as_asked(scene: Scene, tmp_path: P
         run = Lap(scene, tmp_path / name, **options)
         run.stage(loop)
         assert (run.summary["loop"]["closures"] > 0) == is_closed and len(refined) == n_looks
-    assert refined[0]["depth"].most == 4 and refined[0]["depth"].weight == 7.0
+    assert refined[0].depth.most == 4 and refined[0].depth.weight == 7.0
 
 
 @pytest.mark.shows("loop.main_segment")

@@ -17,7 +17,7 @@ from slamcli.geometry import se3
 from slamcli.schema import KEY_FRAME, LOST, ON_DEPTH, Features, Matches, Timing, Tracks, Words, frame_poses
 from slamcli.slam import final_refinement, loop_pose_graph
 from slamcli.slam.depth_tracking import DepthAligner, FramePoints
-from slamcli.slam.final_refinement import DepthEdges
+from slamcli.slam.final_refinement import DepthEdges, Refinement
 from slamcli.slam.recording import Recording
 from slamcli.slam.tracker import Tracker
 from slamcli.sparse_map import map_adjustment
@@ -202,15 +202,15 @@ def test_a_second_look_joins_key_frames_that_see_the_same_and_moves_them_to_wher
     store = FrameStore(sparse_map.features, KINECT, SENSOR)
     timing = Timing(np.array(0.0), np.array(0.0), np.array(0.0), np.zeros((n, 6)))
     depth = DepthEdges(FramePoints(coded(corner().of(frames)), KINECT, SENSOR), timing, most=most)
-    look = {"depth": depth, "iterations": 20, "progress": lambda items, *_: items}
-    after, result = final_refinement.refine_all(sparse_map, store, tracks, TrackConfig(), **look)
+    by, progress = Refinement(TrackConfig(), depth, iterations=20), lambda items, *_: items
+    after, result = final_refinement.refine_all(sparse_map, store, tracks, by, progress=progress)
     assert len(sparse_map.edge) == {0: 0, 1: 3, 6: 6}[most]
     assert (after.state == KEY_FRAME).all() and result.cost[-1] < result.cost[0]
     true = turn(14)[frames]
     e = se3.log((se3.inverse(sparse_map.kf.T_wk[0]) @ sparse_map.kf.T_wk) @ se3.inverse(se3.inverse(true[0]) @ true))
     error = np.linalg.norm(e[1:, :3], axis=1).mean()
     assert 1e-4 < error < 0.01 if most else error > 0.02
-    final_refinement.refine_all(sparse_map, store, after, TrackConfig(), **look)
+    final_refinement.refine_all(sparse_map, store, after, by, progress=progress)
     assert len(sparse_map.edge) == {0: 0, 1: 3, 6: 6}[most], "no pair is joined twice"
 
 
@@ -223,9 +223,9 @@ def test_optimize_aligns_as_many_depth_images_as_asked(most, n_edges):
     sensing = Sensing(KINECT, Timing(np.array(0.0), np.array(0.0), np.array(np.nan), np.zeros((n, 6))), {})
     option = OptimizeConfig(depth_icp_edges=most, readout=False, move_depth=False)
     optimize.refine(
-        sparse_map, sparse_map.features, tracks, sensing, SimpleNamespace(optimize=option, sensor=SENSOR, track=TrackConfig()),
+        sparse_map, optimize.Extracted(sparse_map.features, FramePoints(coded([corner()[frame] for frame in frames]), KINECT, SENSOR)),
+        tracks, sensing, SimpleNamespace(optimize=option, sensor=SENSOR, track=TrackConfig()),
         SimpleNamespace(progress=lambda items, *_: items, workers=1),
-        frame_points=FramePoints(coded([corner()[frame] for frame in frames]), KINECT, SENSOR),
     )  # fmt: skip
     assert len(sparse_map.edge) == n_edges
 

@@ -58,7 +58,7 @@ def test_features_are_those_of_each_frame(room: Path, features: Features) -> Non
     dataset = open_dataset(str(room))
     assert len(features.stamp) == len(dataset) and features.octave_scale == Config().extract.scale
     for i in (0, 17, len(dataset) - 1):
-        points = orb.detect(dataset.grey(i), features=200)
+        points = orb.detect(dataset.grey(i), ExtractConfig(features=200))
         span = slice(features.offset[i], features.offset[i + 1])
         np.testing.assert_array_equal(features.desc[span], points.desc)
         np.testing.assert_allclose(features.xy[span], dataset.camera.undistort(points.xy), atol=1e-4)
@@ -184,7 +184,7 @@ def test_words_find_nearly_what_brute_force_finds(features: Features, tmp_path: 
     expected = {(p, *row) for p in range(len(brute.pair)) for row in brute.row[brute.offset[p] : brute.offset[p + 1]].tolist()}
     assert 0.85 < len(found & expected) / len(expected) < 1.0
     i, j = (slice(features.offset[f], features.offset[f + 1]) for f in brute.pair[4])
-    rows, _ = hamming.match_brute(features.desc[i], features.desc[j], features.angle[i], features.angle[j])
+    rows, _ = hamming.match_brute(*(hamming.Described(features.desc[rows], features.angle[rows]) for rows in (i, j)))
     np.testing.assert_array_equal(rows, brute.row[brute.offset[4] : brute.offset[5]])
 
 

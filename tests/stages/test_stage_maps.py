@@ -20,7 +20,7 @@ from slamcli.formats import cloud, octomap
 from slamcli.geometry import se3
 from slamcli.schema import FrameTimes, Ground, Map, Moving, Timing, Tracks
 from slamcli.stages import densify, octree
-from slamcli.stages.depth_frames import depth_poses
+from slamcli.stages.depth_frames import DepthFrames, depth_poses
 
 SETTINGS = {"seed": 1, "frames": 220, "laps": 2.0, "width": 160, "height": 120, "movable": True}
 CFG = Config(
@@ -166,7 +166,7 @@ def test_the_octree_agrees_with_the_images_it_was_made_from(done: Done) -> None:
     tree = octomap.read(done.folder / "octree" / "map.ot")
     T_lw = artifacts.load(Ground, done.folder / "densify").T_lw
     poses = [(frame, T_lw @ T_wk) for frame, T_wk in depth_poses(done.inputs)]
-    scans = octree.scans(done.inputs.dataset, done.inputs.camera(), poses, CFG.sensor, CFG.octree)
+    scans = octree.scans(DepthFrames(done.inputs.dataset, done.inputs.camera()), poses, CFG.sensor, CFG.octree)
     result = occupancy.accuracy(tree, scans, max_range=CFG.octree.max_range)
     assert 0.97 < result.share < 1.0
     assert result.unknown == 0

@@ -7,6 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from slamcli.vision import hamming
+from slamcli.vision.hamming import Described
 
 seeds = st.integers(0, 2**32 - 1)
 sizes = st.integers(0, 25)
@@ -29,7 +30,7 @@ def as_list(found: hamming.Match) -> list[tuple[int, int, int]]:
 def test_brute_force_is_its_twin(seed: int, n_i: int, n_j: int, max_distance: int, ratio: float) -> None:
     rng = np.random.default_rng(seed)
     a, b = descriptors(rng, n_i), descriptors(rng, n_j)
-    found = hamming.match_brute(a, b, np.zeros(n_i), np.zeros(n_j), max_distance=max_distance, ratio=ratio)
+    found = hamming.match_brute(Described(a, np.zeros(n_i)), Described(b, np.zeros(n_j)), max_distance=max_distance, ratio=ratio)
     expected = naive.matches(a, b, np.ones((n_i, n_j), bool), max_distance, ratio) if n_i and n_j else []
     assert as_list(found) == expected
 
@@ -44,7 +45,7 @@ def test_under_nodes_only_features_with_one_in_common_are_compared(seed: int, n_
         node[(node[:, 0] == node[:, 1]) | (not has_second), 1] = -1
     first = node_i[:, :1] == node_j[:, 0]
     crossed = (node_i[:, 1:] == node_j[:, 0]) | (node_i[:, :1] == node_j[:, 1])
-    found = hamming.match_nodes(a, node_i, b, node_j, np.zeros(n_i), np.zeros(n_j), max_distance=256, ratio=1.0)
+    found = hamming.match_nodes(Described(a, np.zeros(n_i), node_i), Described(b, np.zeros(n_j), node_j), max_distance=256, ratio=1.0)
     expected = naive.matches(a, b, first | crossed, 256, hamming.NODE_RATIO) if n_i and n_j else []
     assert as_list(found) == expected
 
@@ -62,12 +63,11 @@ EXTREMES = {
 @pytest.mark.parametrize("ratio", [0.8, 1.0])
 def test_ties_and_extremes_are_matched_as_by_the_twin(name: str, ratio: float) -> None:
     a, b = EXTREMES[name]
-    angles = np.zeros(len(a)), np.zeros(len(b))
     every = np.ones((len(a), len(b)), bool)
-    found = hamming.match_brute(a, b, *angles, max_distance=256, ratio=ratio)
+    found = hamming.match_brute(Described(a, np.zeros(len(a))), Described(b, np.zeros(len(b))), max_distance=256, ratio=ratio)
     assert as_list(found) == naive.matches(a, b, every, 256, ratio)
-    nodes = np.zeros((len(a), 2), np.int32) - [0, 1], np.zeros((len(b), 2), np.int32) - [0, 1]
-    found = hamming.match_nodes(a, nodes[0], b, nodes[1], *angles, max_distance=256, ratio=ratio)
+    i, j = (Described(one, np.zeros(len(one)), np.zeros((len(one), 2), np.int32) - [0, 1]) for one in (a, b))
+    found = hamming.match_nodes(i, j, max_distance=256, ratio=ratio)
     assert as_list(found) == naive.matches(a, b, every, 256, ratio * hamming.NODE_RATIO)
 
 
@@ -75,9 +75,9 @@ def test_one_column_of_nodes_means_no_second_node() -> None:
     rng = np.random.default_rng(3)
     a, b = descriptors(rng, 40), descriptors(rng, 50)
     node_i, node_j = rng.integers(0, 5, 40), rng.integers(0, 5, 50)
-    one = hamming.match_nodes(a, node_i, b, node_j, np.zeros(40), np.zeros(50))
+    one = hamming.match_nodes(Described(a, np.zeros(40), node_i), Described(b, np.zeros(50), node_j))
     two = hamming.match_nodes(
-        a, np.stack([node_i, 0 * node_i - 1], 1), b, np.stack([node_j, 0 * node_j - 1], 1), np.zeros(40), np.zeros(50)
+        Described(a, np.zeros(40), np.stack([node_i, 0 * node_i - 1], 1)), Described(b, np.zeros(50), np.stack([node_j, 0 * node_j - 1], 1))
     )
     assert as_list(one) == as_list(two)
 
@@ -89,8 +89,8 @@ def test_the_turn_check_keeps_the_fullest_bins(seed: int, n: int) -> None:
     desc = rng.integers(0, 256, (n, 32)).astype(np.uint8)
     angle_i = (rng.choice([0.0, 0.3, 2.0, 6.0], n) + rng.uniform(-4, 4, n)).astype(np.float32)
     angle_j = rng.uniform(-4, 4, n).astype(np.float32)
-    rows, _ = hamming.match_brute(desc, desc, angle_i, angle_j, ratio=1.0)
-    every, _ = hamming.match_brute(desc, desc, angle_i, angle_j, ratio=1.0, check_rotation=False)
+    rows, _ = hamming.match_brute(Described(desc, angle_i), Described(desc, angle_j), ratio=1.0)
+    every, _ = hamming.match_brute(Described(desc, angle_i), Described(desc, angle_j), ratio=1.0, check_rotation=False)
     assert len(every) == n
     is_kept = naive.agreeing([float(angle_i[k]) - float(angle_j[k]) for k in range(n)])
     assert rows[:, 0].tolist() == np.flatnonzero(is_kept).tolist()
@@ -100,7 +100,7 @@ def test_one_wrong_turn_among_many_right_ones_goes() -> None:
     desc = np.random.default_rng(0).integers(0, 256, (40, 32)).astype(np.uint8)
     turn = np.full(40, 0.2)
     turn[7] = 2.5
-    rows, _ = hamming.match_brute(desc, desc, turn, np.zeros(40))
+    rows, _ = hamming.match_brute(Described(desc, turn), Described(desc, np.zeros(40)))
     assert rows[:, 0].tolist() == [k for k in range(40) if k != 7]
 
 
@@ -108,8 +108,9 @@ def test_one_wrong_turn_among_many_right_ones_goes() -> None:
 def test_nothing_matches_nothing(n_i: int, n_j: int) -> None:
     desc = np.zeros((5, 32), np.uint8)
     node = np.zeros((5, 2), np.int32)
-    assert as_list(hamming.match_brute(desc[:n_i], desc[:n_j], np.zeros(n_i), np.zeros(n_j))) == []
-    assert as_list(hamming.match_nodes(desc[:n_i], node[:n_i], desc[:n_j], node[:n_j], np.zeros(n_i), np.zeros(n_j))) == []
+    i, j = (Described(desc[:n], np.zeros(n), node[:n]) for n in (n_i, n_j))
+    assert as_list(hamming.match_brute(i, j)) == []
+    assert as_list(hamming.match_nodes(i, j)) == []
 
 
 def test_columns_of_different_length_are_refused() -> None:
@@ -119,6 +120,7 @@ def test_columns_of_different_length_are_refused() -> None:
         (node, node[:4], angle[:4], angle),
         (node, np.zeros((6, 2)), angle, angle),
         (node - 1, node, angle, angle),
+        (None, node, angle, angle),
     ):
         with pytest.raises(ValueError, match="each descriptor needs"):
-            hamming.match_nodes(desc, columns[0], desc, columns[1], columns[2], columns[3])
+            hamming.match_nodes(Described(desc, columns[2], columns[0]), Described(desc, columns[3], columns[1]))

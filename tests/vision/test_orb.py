@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from textures import texture
 
+from slamcli.config.options import ExtractConfig
 from slamcli.errors import SlamError
 from slamcli.vision import orb, pyramid
 from slamcli.vision.comparison import evenness, plain_orb, side_by_side
@@ -26,14 +27,14 @@ def check(points: orb.KeyPoints, grey: np.ndarray, wanted: int) -> None:
 
 
 @pytest.mark.parametrize(
-    "options", [{}, {"smooth": False, "subpixel": False, "pool": 0, "rank_by": "sum", "threshold": 20, "threshold_low": 7}]
+    "options", [{}, {"smooth": False, "subpixel": False, "pool": 0, "rank_by": "sum", "fast_threshold": 20, "fast_threshold_low": 7}]
 )
 def test_as_many_points_as_wanted_and_the_same_every_time(options: dict) -> None:
     grey = texture(3, 240, 320)
-    points = orb.detect(grey, features=300, **options)
+    points = orb.detect(grey, ExtractConfig(features=300, **options))
     check(points, grey, 300)
     assert len(points) == 300 and len(np.unique(points.octave)) >= 5
-    again = orb.detect(np.asfortranarray(grey), features=300, **options)
+    again = orb.detect(np.asfortranarray(grey), ExtractConfig(features=300, **options))
     for name in ("xy", "octave", "angle", "response", "desc"):
         np.testing.assert_array_equal(getattr(points, name), getattr(again, name))
 
@@ -105,10 +106,10 @@ def test_levels_shrink_by_the_scale_and_lie_beneath_each_other(height: int, widt
 def test_images_of_other_sizes_between_change_nothing() -> None:
     """A thread keeps the memory it works in: what the last image left there must not show."""
     greys = [texture(3, 240, 320), texture(5, 333, 201), np.full((240, 320), 7, np.uint8)]
-    first = orb.detect(greys[0], features=300)
+    first = orb.detect(greys[0], ExtractConfig(features=300))
     for grey in greys[1:]:
-        orb.detect(grey, features=300)
-        again = orb.detect(greys[0], features=300)
+        orb.detect(grey, ExtractConfig(features=300))
+        again = orb.detect(greys[0], ExtractConfig(features=300))
         for name in ("xy", "octave", "angle", "response", "desc"):
             np.testing.assert_array_equal(getattr(again, name), getattr(first, name))
 
@@ -140,7 +141,12 @@ def test_points_are_spread_more_evenly_than_plain_orbs_and_the_fewer_weak_ones_a
     grey[240:, :] = 110 + 8 * faint
     none, ours, every, plain = (
         evenness(detect(grey).xy, 640, 480)
-        for detect in (partial(orb.detect, weak=0.0), orb.detect, partial(orb.detect, weak=1.0), plain_orb)
+        for detect in (
+            partial(orb.detect, settings=ExtractConfig(weak=0.0)),
+            orb.detect,
+            partial(orb.detect, settings=ExtractConfig(weak=1.0)),
+            plain_orb,
+        )
     )
     assert ours.share >= 1.5 * plain.share and ours.ratio <= 0.75 * plain.ratio
     assert every.share >= 1.5 * ours.share and every.ratio <= 0.5 * plain.ratio
@@ -157,13 +163,13 @@ def test_evenness_of_known_spreads() -> None:
 
 def test_the_picture_shows_both() -> None:
     grey = texture(4, 120, 160)
-    picture = side_by_side(grey, plain_orb(grey, 200), orb.detect(grey, features=200))
+    picture = side_by_side(grey, plain_orb(grey, 200), orb.detect(grey, ExtractConfig(features=200)))
     assert picture.shape == (148, 328, 3) and picture.dtype == np.uint8
 
 
 def test_each_key_point_is_drawn_where_it_is() -> None:
     grey = texture(4, 120, 160)
-    plain, ours = plain_orb(grey, 200), orb.detect(grey, features=200)
+    plain, ours = plain_orb(grey, 200), orb.detect(grey, ExtractConfig(features=200))
     picture = side_by_side(grey, plain, ours).astype(int)
     is_drawn = picture[:, :, 1] - picture[:, :, 2] > 40
     for points, left in ((plain, 0), (ours, 168)):
