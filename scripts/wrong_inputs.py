@@ -13,6 +13,7 @@ import argparse
 import json
 import shutil
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -108,10 +109,14 @@ CASES: dict[str, tuple[Callable[[Path], None], set[str]]] = {
     "fx, fy halved": (scaled(fx=0.5, fy=0.5), {"focal_length"}),
     "fx, fy doubled": (scaled(fx=2.0, fy=2.0), {"focal_length"}),
     "fx, fy x 1.15": (scaled(fx=1.15, fy=1.15), {"focal_length"}),
+    "fx, fy x 0.8": (scaled(fx=0.8, fy=0.8), {"focal_length"}),
     "cx 20 px off": (added(cx=20.0), {"principal_point"}),
     "cy 20 px off": (added(cy=-20.0), {"principal_point"}),
+    "cx 30 px off": (added(cx=30.0), {"principal_point"}),
     "depth x 1.5": (depth(lambda d: np.minimum(np.rint(d * 1.5), 65535).astype(np.uint16)), {"depth_scale"}),
     "depth scale x 1.5": (scaled(depth_scale=1.5), {"depth_scale"}),
+    "depth x 0.9": (depth(lambda d: np.rint(d * 0.9).astype(np.uint16)), {"depth_scale"}),
+    "depth shifted by 10 px": (depth(partial(shifted, pixels=10)), {"registration", "depth_shift"}),
     "depth shifted by 20 px": (depth(shifted), {"registration"}),
     "one depth image": (frozen("depth"), {"frozen_depth"}),
     "one colour image": (frozen("rgb"), {"frozen_colour"}),
@@ -123,6 +128,11 @@ CASES: dict[str, tuple[Callable[[Path], None], set[str]]] = {
     "k1 = 1e300": (added(k1=1e300), {REFUSED}),
     "k1 = 0.4": (added(k1=0.4), {"lens"}),
     "depth one frame late": (lambda folder: images(folder, "depth", lambda pictures: [pictures[0], *pictures[:-1]]), {"depth_delay"}),
+    "depth one frame early": (lambda folder: images(folder, "depth", lambda pictures: [*pictures[1:], pictures[-1]]), {"depth_delay"}),
+    "colour mirrored": (
+        lambda folder: images(folder, "rgb", lambda pictures: [picture[:, ::-1] for picture in pictures]),
+        {"registration"},
+    ),
     "all depth zero": (depth(np.zeros_like), {"depth_readings"}),
 }
 

@@ -2,6 +2,7 @@
 
 import contextlib
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -47,13 +48,16 @@ def test_every_file_of_a_recording_and_of_a_run_is_read_or_refused_when_it_is_mu
 def test_a_parser_that_fails_hangs_or_eats_memory_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fuzz, "SECONDS", 0.2)
 
+    monkeypatch.setattr(fuzz, "WAITED", 3)
+
     def endless(path: Path) -> None:
         while True:
             pass
 
     for read, kind in (
         (lambda path: 1 / 0, "ZeroDivisionError"),
-        (endless, "TooSlowError"),
+        (endless, "s of CPU"),
+        (lambda path: time.sleep(60), "TooSlowError"),
         (lambda path: bytearray(2 << 30), "MemoryError"),
     ):
         failures = list(fuzz.fuzz(fuzz.Parser("x", (b"abc",), read), tmp_path, inputs=2, seed=0, tally=fuzz.Tally()))
