@@ -27,6 +27,9 @@ def list_command(folder: Path, as_json: bool) -> None:
         click.echo(json.dumps([one.to_dict() for one in found], indent=1))
     elif found:
         click.echo(console.table([["run", "recording", "last stage", "frames", "size"], *map(_row, found)], right=(4,)))
+        for one in found:
+            if one.damage:
+                click.echo(f"Warning: {one.damage}", err=True)
     else:
         click.echo(f"no run below {folder}; make one with: slamcli run demo", err=True)
 
@@ -36,7 +39,7 @@ def _row(one: Listed) -> list[str]:
     return [
         f"{one.path}{' *' if one.is_latest else ''}",
         one.recording,
-        one.stages[-1] if one.stages else "-",
+        "damaged" if one.damage else one.stages[-1] if one.stages else "-",
         frames,
         f"{one.size / 1e6:.1f} MB",
     ]

@@ -30,6 +30,7 @@ class Listed:
     located: int | None
     size: int  # bytes
     is_latest: bool
+    damage: str = ""  # what is wrong with it and how it is repaired, where nothing else can be said of it
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values."""
@@ -37,13 +38,18 @@ class Listed:
 
 
 def list_runs(folder: Path = RUNS) -> list[Listed]:
-    """List the runs below a folder, by name; what is no readable run is passed over."""
+    """List the runs below a folder, by name; what is damaged is listed as that, and what is no run of this version is passed over."""
     latest = LATEST.resolve() if LATEST.exists() else None
     found = []
     for path in sorted(_run_folders(folder, DEEPEST)):
         try:
             run = RunDir.find(str(path))
             found.append(_listed(run, is_latest=path.resolve() == latest))
+        except Damaged as error:
+            if not any((path / stage / "stage.json").is_file() for stage in NAMES):  # another program's run.json
+                continue
+            size = sum(file.stat().st_size for file in files_of(RunDir(path)))
+            found.append(Listed(str(path), "", [], None, None, size, path.resolve() == latest, damage=str(error)))
         except SlamError:
             continue
     return found

@@ -46,6 +46,16 @@ def test_list_names_runs_below_runs_and_nothing_else(made, here, slamcli) -> Non
     assert slamcli("list", here / "nowhere").stdout == ""
 
 
+@pytest.mark.parametrize("name", ["run.json", "densify/stage.json"])
+def test_a_damaged_run_is_listed_as_that(made, slamcli, name: str) -> None:
+    data = (made / name).read_bytes()
+    (made / name).write_bytes(data[:-5] + b"\0" + data[-4:])
+    (listed,) = json.loads(slamcli("list", "--json").stdout)
+    assert listed["path"] == "runs/mine" and listed["size"] > 1000 and "slamcli run -r runs/mine" in listed["damage"]
+    shown = slamcli("list")
+    assert "damaged" in shown.stdout and f"Warning: runs/mine/{name}: " in shown.stderr
+
+
 def test_clean_keeps_the_results_and_says_what_it_freed(made, slamcli, tmp_path) -> None:
     before = {path: path.stat().st_size for stage in housekeeping.INTERMEDIATE for path in (made / stage).rglob("*") if path.is_file()}
     freed = json.loads(slamcli("clean", "--keep", "results", "-r", "mine", "--json").stdout)["freed"]
