@@ -14,12 +14,14 @@ import numpy as np
 from numba import f4, i4, i8, u1, u8
 
 from slamcli.dense.ray_casting import OCCUPIED, mark_scan
+from slamcli.errors import SlamError
 from slamcli.geometry import elementary, voxel
 from slamcli.geometry.octree import CENTRE, DEPTH, Octree
 from slamcli.geometry.voxel import find_or_add, spread
 from slamcli.jit.kernel import kernel
 
 BLOCK_CELLS = 512  # 8 x 8 x 8, within a block in Morton order
+MAX_BLOCKS = 400_000  # 2 GiB, twice that while the table grows; 25 000 m3 at 0.05 m
 UNTOUCHED, TOUCHED = -1, -2  # blocks of a scan's bounding box, until their row is known
 
 
@@ -65,6 +67,8 @@ class OccupancyMap:
         max_range : farther points only free the space up to this range [m]; 0 = no limit
         discretize : cast one ray per end cell, to its centre, instead of one per point
         frame : number of the scan, for `doubted`
+
+        Raises SlamError where the map would outgrow memory.
         """
         marked = mark_scan(x_w, origin, max_range=max_range, resolution=self.resolution, discretize=discretize)
         if marked is None:
@@ -73,7 +77,13 @@ class OccupancyMap:
         rows_of_8 = marks.view(np.uint64)
         block_row = np.full(np.array(marks.shape) >> 3, UNTOUCHED, dtype=np.int32)
         blocks = self._blocks
-        blocks.reserve(_touch_blocks(rows_of_8, block_row))
+        n_touched = _touch_blocks(rows_of_8, block_row)
+        if max(n_touched, blocks.n) > MAX_BLOCKS:
+            size = MAX_BLOCKS * BLOCK_CELLS * sum(column.itemsize for column in blocks.columns.values()) / (1 << 30)
+            raise SlamError(
+                f"an octree of {self.resolution:g} m cells would fill more than {size:.0f} GiB of memory: raise octree.resolution"
+            )
+        blocks.reserve(n_touched)
         blocks.n = _update_cells(
             rows_of_8, lower, block_row, blocks.slot_row, blocks.row_key, blocks.n, *blocks.columns.values(), *self._update, frame
         )

@@ -108,6 +108,21 @@ def test_probabilities_stay_clamped_and_an_object_taken_away_fades() -> None:
     assert scans_until_free == 9  # ln(0.971 / 0.029) / ln(0.6 / 0.4) = 8.66, however long it had stood there
 
 
+def test_a_map_that_would_outgrow_memory_is_refused_before_room_is_made_for_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    near = np.stack([np.full(200, 2.0), np.linspace(-1, 1, 200), np.linspace(-1, 1, 200)], axis=1)
+    aside, grid = np.array([0.0, 4.0, 0.0]), OccupancyMap(0.05, **MODEL)
+    grid.insert(near, np.zeros(3), max_range=5.0)
+    known = grid._blocks.n
+    monkeypatch.setattr(occupancy, "MAX_BLOCKS", 3 * known // 2)
+    grid.insert(near + aside, aside, max_range=5.0)
+    assert grid._blocks.n > 3 * known // 2, "a scan is small beside the bound, and is not cut"
+    with pytest.raises(SlamError, match=r"0\.05 m cells would fill .* raise octree\.resolution"):
+        grid.insert(near, np.zeros(3), max_range=5.0)
+    monkeypatch.setattr(occupancy, "MAX_BLOCKS", known // 2)
+    with pytest.raises(SlamError, match=r"raise octree\.resolution"):
+        OccupancyMap(0.05, **MODEL).insert(near, np.zeros(3), max_range=5.0)  # one scan alone
+
+
 def test_leaves_are_sorted_and_unique() -> None:
     grid = OccupancyMap(0.05, **MODEL)
     grid.insert(room_scan(np.random.default_rng(2), np.zeros(3)), np.zeros(3), max_range=4.0)
