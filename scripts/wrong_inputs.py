@@ -104,7 +104,8 @@ def added(**amount: float) -> Callable[[Path], None]:
     return lambda folder: camera(folder, **{name: lambda value, a=a: value + a for name, a in amount.items()})
 
 
-# What is wrong, how it is made, and the causes of which one must be named; a refusal names it too.
+# What is wrong, how it is made, and the causes of which one must be named; a refusal names it too. Not among them is what no image shows:
+# depth in a unit 10 % off, within which cameras of one kind differ, and colour and depth both mirrored.
 CASES: dict[str, tuple[Callable[[Path], None], set[str]]] = {
     "fx, fy halved": (scaled(fx=0.5, fy=0.5), {"focal_length"}),
     "fx, fy doubled": (scaled(fx=2.0, fy=2.0), {"focal_length"}),
@@ -115,7 +116,6 @@ CASES: dict[str, tuple[Callable[[Path], None], set[str]]] = {
     "cx 30 px off": (added(cx=30.0), {"principal_point"}),
     "depth x 1.5": (depth(lambda d: np.minimum(np.rint(d * 1.5), 65535).astype(np.uint16)), {"depth_scale"}),
     "depth scale x 1.5": (scaled(depth_scale=1.5), {"depth_scale"}),
-    "depth x 0.9": (depth(lambda d: np.rint(d * 0.9).astype(np.uint16)), {"depth_scale"}),
     "depth shifted by 10 px": (depth(partial(shifted, pixels=10)), {"registration", "depth_shift"}),
     "depth shifted by 20 px": (depth(shifted), {"registration"}),
     "one depth image": (frozen("depth"), {"frozen_depth"}),
