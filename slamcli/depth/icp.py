@@ -18,6 +18,7 @@ import numpy as np
 from slamcli.config.options import SensorConfig, SurfaceConfig
 from slamcli.depth import icp_kernels as kernels
 from slamcli.depth import noise_model, oriented_points
+from slamcli.depth.icp_kernels import NormalEquations, Points, Rule, View
 from slamcli.geometry import depth_noise, se3
 from slamcli.geometry.algebra import eigh, product
 from slamcli.geometry.camera import Camera
@@ -34,6 +35,7 @@ READINGS_AS_ONE = 500.0
 START_SIGMA = np.array([0.2, 0.2, 0.2, 0.2, 0.2, 0.2])
 DIRECTIONS = 6  # of motion
 DETERMINED_SIGMA = 0.01  # [m] a direction known to this at the mean depth is determined; noise alone feigns 0.015 to 0.03 over planes
+RULE = Rule(MIN_COSINE, HUBER_CHI2, READINGS_AS_ONE)
 
 
 class Pass(NamedTuple):
@@ -68,6 +70,16 @@ class OrientedPoints:
 
     def __len__(self) -> int:
         return len(self.xyz)
+
+    @property
+    def points(self) -> Points:
+        """Return the points as the kernels take them."""
+        return Points(self.xyz, self.normal, self.variance)
+
+    @property
+    def view(self) -> View:
+        """Return which point each pixel shows, as the kernels take it."""
+        return View(self.row, self.pinhole)
 
 
 @dataclass(frozen=True)
@@ -154,14 +166,12 @@ def align(T_ij: np.ndarray, source: OrientedPoints, target: OrientedPoints, *, p
     if prior is not None:
         H_prior = H_prior + prior.information
         b_prior = product(prior.information, se3.log(product(prior.T, se3.inverse(T))))
-    H, b = np.zeros((6, 6)), np.zeros(6)
-    points = (source.xyz, source.normal, source.variance)
-    surface = (target.row, target.xyz, target.normal, target.variance, target.pinhole)
-    met, agree, cost = kernels.align(T, *points, *surface, SCHEDULE, MIN_COSINE, HUBER_CHI2, READINGS_AS_ONE, H_prior, b_prior, H, b)
+    found = NormalEquations(np.zeros((6, 6)), np.zeros(6))
+    met, agree, cost = kernels.align(T, source.points, target.points, target.view, SCHEDULE, RULE, NormalEquations(H_prior, b_prior), found)
     factor = READINGS_AS_ONE * max(cost / max(agree, 1), kernels.LEAST_VARIANCE_FACTOR)
     return Alignment(
         T_ij=se3.orthonormalize(T),
-        information=(np.triu(H) + np.triu(H, 1).T) / factor,
+        information=(np.triu(found.H) + np.triu(found.H, 1).T) / factor,
         overlap=agree / max(len(source), 1),
         agreement=agree / max(met, 1),
         rms=float(np.sqrt(cost / max(agree, 1))),

@@ -1,5 +1,7 @@
 """Kernels of icp.py: depth images made coarse, and point-to-plane alignment by Gauss-Newton."""
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import f4, f8, i4, i8
 
@@ -10,6 +12,36 @@ from slamcli.jit.kernel import kernel
 Z_MIN = 0.05  # [m] a point nearer to the image plane than this, or behind it, falls on nothing
 LEAST_VARIANCE_FACTOR = 0.01  # mean of w chi2: of less, images that are equal give no evidence
 BAND = 0.05  # of the nearest reading: readings farther behind it belong to another surface
+
+
+class Points(NamedTuple):
+    """The surface of one depth image, as points with normals."""
+
+    xyz: f4[:, ::1]  # (N, 3) [m], camera frame
+    normal: f4[:, ::1]  # (N, 3) unit, towards the camera
+    variance: f4[::1]  # (N,) [m^2], of a reading along the ray
+
+
+class View(NamedTuple):
+    """Which point each pixel shows."""
+
+    row: i4[:, ::1]  # (h, w), -1 = none
+    pinhole: f8[::1]  # fx, fy, cx, cy [px]
+
+
+class Rule(NamedTuple):
+    """When points that meet agree, and what they count."""
+
+    min_cosine: float  # of their normals
+    limit: float  # chi2 from which Huber's cost grows like the root
+    readings_as_one: float  # what H and b are divided by, beside the variance factor
+
+
+class NormalEquations(NamedTuple):
+    """H xi = b of the left twist of T_ij."""
+
+    H: f8[:, ::1]  # (6, 6)
+    b: f8[::1]  # (6,)
 
 
 @kernel(error_model="numpy")
@@ -36,17 +68,24 @@ def window_means(depth: f4[:, ::1], side: i8, first: i8, width: i8, out: f4[:, :
 
 
 @kernel(error_model="numpy")
-def _normal_equations(
-    T, xyz_j, normal_j, variance_j, row_i, xyz_i, normal_i, variance_i, pinhole, step, reach, min_cosine, limit, is_final, H, b
-):  # fmt: skip
+def _normal_equations(T, source, target, view, step, reach, rule, is_final, out):
     """Write H = sum w J^T J and b = -sum w J^T r over every `step`-th point of j; return points met, points that agree, sum of w chi2.
 
     r = n_i (q - x_i) is the distance from the plane of i, J = (n_i, q x n_i) its derivative by the left twist of T_ij, w its inverse
-    variance times Huber's weight from chi2 = `limit` on.
+    variance times Huber's weight from chi2 = `rule.limit` on.
 
     Normals err, and so add to H in directions in which nothing is known: over a plane, as if it were rough. In the end, therefore,
     H = sum w (J^T M + M^T J) / 2, with M the same of the normal of j: their errors are independent, and their products vanish on average.
     """
+    xyz_j, normal_j, variance_j, xyz_i, normal_i, variance_i = (
+        source.xyz,
+        source.normal,
+        source.variance,
+        target.xyz,
+        target.normal,
+        target.variance,
+    )
+    row_i, pinhole, min_cosine, limit, H, b = view.row, view.pinhole, rule.min_cosine, rule.limit, out.H, out.b
     h00 = h01 = h02 = h03 = h04 = h05 = h11 = h12 = h13 = h14 = h15 = h22 = h23 = h24 = h25 = 0.0
     h33 = h34 = h35 = h44 = h45 = h55 = b0 = b1 = b2 = b3 = b4 = b5 = cost = 0.0
     T00, T01, T02, T03, T10, T11, T12, T13 = T[0, 0], T[0, 1], T[0, 2], T[0, 3], T[1, 0], T[1, 1], T[1, 2], T[1, 3]
@@ -124,48 +163,37 @@ def _normal_equations(
 @kernel(error_model="numpy")
 def align(
     T_ij: f8[:, ::1],
-    xyz_j: f4[:, ::1],
-    normal_j: f4[:, ::1],
-    variance_j: f4[::1],
-    row_i: i4[:, ::1],
-    xyz_i: f4[:, ::1],
-    normal_i: f4[:, ::1],
-    variance_i: f4[::1],
-    pinhole: f8[::1],
+    source: Points,
+    target: Points,
+    view: View,
     schedule: f8[:, ::1],
-    min_cosine: f8,
-    limit: f8,
-    readings_as_one: f8,
-    H_known: f8[:, ::1],
-    b_known: f8[::1],
-    H: f8[:, ::1],
-    b: f8[::1],
+    rule: Rule,
+    known: NormalEquations,
+    out: NormalEquations,
 ):
-    """Move T_ij (4, 4), in place, to where the points of j agree best with those of i; write H (upper triangle) and b there.
+    """Move T_ij (4, 4), in place, to where the points of j, the source, agree best with those of i; write H (upper triangle) and b there.
 
-    A point of j meets the one of i that `row_i` (h, w) gives, -1 = none, where `pinhole` (fx, fy, cx, cy) projects it. They agree when
-    they are within reach and the cosine of their normals is at least `min_cosine`. Returns points met, points that agree, sum of w chi2.
+    A point of j meets the one of i that `view` shows where it projects to. They agree when they are within reach and their normals are
+    alike. Returns points met, points that agree, sum of w chi2.
 
     schedule : (S, 4) rows of step, reach [m], iterations at most, length of a step of the motion that ends them
-    readings_as_one : what H and b are divided by, beside the variance factor, against H_known and b_known, known at the start besides
+    known : what is known at the start besides
     """
     A, g, total, xi, L = np.empty((6, 6)), np.empty(6), np.zeros(6), np.empty(6), np.empty((6, 6))
     s, done = 0, 0
     while True:  # one call, so that what it calls is compiled into this kernel once
         is_final = s == len(schedule)
         step, reach = (1, schedule[s - 1, 1]) if is_final else (int(schedule[s, 0]), schedule[s, 1])
-        met, agree, cost = _normal_equations(
-            T_ij, xyz_j, normal_j, variance_j, row_i, xyz_i, normal_i, variance_i, pinhole, step, reach, min_cosine, limit, is_final, H, b
-        )  # fmt: skip
+        met, agree, cost = _normal_equations(T_ij, source, target, view, step, reach, rule, is_final, out)
         if is_final:
             return met, agree, cost
         done += 1
-        weight = step / (readings_as_one * max(cost / max(agree, 1), LEAST_VARIANCE_FACTOR))
+        weight = step / (rule.readings_as_one * max(cost / max(agree, 1), LEAST_VARIANCE_FACTOR))
         for i in range(6):
-            g[i] = weight * b[i] + b_known[i]
+            g[i] = weight * out.b[i] + known.b[i]
             for j in range(6):
-                A[i, j] = weight * H[min(i, j), max(i, j)] + H_known[i, j]
-                g[i] -= H_known[i, j] * total[j]
+                A[i, j] = weight * out.H[min(i, j), max(i, j)] + known.H[i, j]
+                g[i] -= known.H[i, j] * total[j]
         length = 0.0
         if solve_damped(A, g, 0.0, L, xi):
             left_update(T_ij, xi)

@@ -1,11 +1,12 @@
 """Kernels of bundle_problem.py: cost, normal equations, elimination of the landmarks, back-substitution.
 
-K key frames of which n are free, L landmarks, O observations. `offset` (L+1,) delimits the observations of a landmark; within a landmark
-they stand in the order of `place` (K,), a key frame's block in the reduced camera system, -1 where the key frame is fixed.
+K key frames of which n are free, L landmarks, O observations.
 `measured` (O, 5) holds per observation u, v [px], depth [m], 1 / sigma_px, 1 / sigma_z. Where 1 / sigma_px is 0 the observation is
 switched off; where 1 / sigma_z is 0 the pixel alone counts. `limits` are the chi2 from which Huber's cost grows like the root, without
 and with depth.
 """
+
+from typing import NamedTuple
 
 import numpy as np
 from numba import f8, i4, i8, u8, uint64
@@ -17,18 +18,57 @@ Z_MIN = 1e-2  # [m] a landmark nearer to the image plane than this, or behind it
 CHI2_BEHIND = 1e6  # what such an observation costs: more than any that can be seen, yet finite, and no slope
 
 
+class Variables(NamedTuple):
+    """What is adjusted."""
+
+    T_cw: f8[:, :, ::1]  # (K, 4, 4)
+    x_w: f8[:, ::1]  # (L, 3) m
+
+
+class Sightings(NamedTuple):
+    """Which key frame each observation is of."""
+
+    kf: u8[::1]  # (O,)
+    offset: i8[::1]  # (L+1,) observations of a landmark; within it they stand in the order of `place`
+    place: i8[::1]  # (K,) a key frame's block in the reduced camera system, -1 where it is fixed
+
+
+class NormalEquations(NamedTuple):
+    """The blocks of the normal equations; of U and V the upper triangles alone, b is minus the gradient."""
+
+    U: f8[:, :, ::1]  # (n, 6, 6) of the free key frames, by their left twists (rho, phi)
+    b_c: f8[:, ::1]  # (n, 6)
+    V: f8[:, :, ::1]  # (L, 3, 3) of the landmarks
+    b_l: f8[:, ::1]  # (L, 3)
+    W: f8[:, :, ::1]  # (O, 3, 6) landmark by key frame, of each observation
+
+    @classmethod
+    def empty(cls, n: int, n_landmarks: int, n_observations: int) -> "NormalEquations":
+        """Make blocks for n free key frames, to be filled."""
+        shapes = (n, 6, 6), (n, 6), (n_landmarks, 3, 3), (n_landmarks, 3), (n_observations, 3, 6)
+        return cls(*(np.empty(shape) for shape in shapes))
+
+    def clear(self) -> None:
+        """Set to 0 what is summed over observations."""
+        for block in (self.U, self.b_c, self.V, self.b_l):
+            block.fill(0.0)
+
+
+class ReducedSystem(NamedTuple):
+    """The reduced camera system S dx_c = rhs, and what eliminating the landmarks leaves."""
+
+    block_of: i4[:, ::1]  # (n, n) number of each block of S
+    S: f8[:, :, ::1]  # (B, 6, 6) blocks on and above the diagonal; of those on it only the upper triangle holds
+    rhs: f8[:, ::1]  # (n, 6)
+    V_inv: f8[:, ::1]  # (L, 6) upper triangles of the inverses of the damped V, 0 where a landmark is not observed
+    scratch: f8[:, :, ::1]  # (most observations of a landmark, 6, 3)
+
+
 @kernel(error_model="numpy")
-def evaluate(
-    T: f8[:, :, ::1],
-    x_w: f8[:, ::1],
-    obs_kf: u8[::1],
-    offset: i8[::1],
-    measured: f8[:, ::1],
-    camera: f8[::1],
-    limits: f8[::1],
-    chi2: f8[::1],
-):
+def evaluate(at: Variables, seen: Sightings, measured: f8[:, ::1], camera: f8[::1], limits: f8[::1], chi2: f8[::1]):
     """Write chi2 (O,), 0 where switched off, and return the sum of Huber's costs."""
+    T, x_w = at
+    obs_kf, offset = seen.kf, seen.offset
     fx, fy, cx, cy = camera[0], camera[1], camera[2], camera[3]
     cost = 0.0
     for lm in range(len(x_w)):
@@ -50,25 +90,10 @@ def evaluate(
 
 
 @kernel(error_model="numpy")
-def linearize(
-    T: f8[:, :, ::1],
-    x_w: f8[:, ::1],
-    obs_kf: u8[::1],
-    offset: i8[::1],
-    place: i8[::1],
-    measured: f8[:, ::1],
-    camera: f8[::1],
-    limits: f8[::1],
-    U: f8[:, :, ::1],
-    b_c: f8[:, ::1],
-    V: f8[:, :, ::1],
-    b_l: f8[:, ::1],
-    W: f8[:, :, ::1],
-):
+def linearize(at: Variables, seen: Sightings, measured: f8[:, ::1], camera: f8[::1], limits: f8[::1], normal: NormalEquations):
     """Add up the blocks of the normal equations with Huber's weights, in arrays that hold 0 before.
 
-    U (n, 6, 6) and b_c (n, 6) of the free key frames, V (L, 3, 3) and b_l (L, 3) of the landmarks, upper triangles alone;
-    W (O, 3, 6) = J_landmark^T w J_pose, written for free key frames alone. b is minus the gradient.
+    W = J_landmark^T w J_pose is written for free key frames alone.
 
     With r = prediction - measurement, each residual's derivative by the point in the camera, scaled by 1 / sigma,
         u: g = (fx/Z, 0, -fx X/Z^2)    v: g = (0, fy/Z, -fy Y/Z^2)    z: g = (0, 0, 1)
@@ -76,6 +101,9 @@ def linearize(
     M = sum w g^T g and q = sum w g^T r of the observation:
         U = [I; x_c^] M [I, -x_c^]    V = R^T M R    W^T = [I; x_c^] M R    b_c = -[q; x_c x q]    b_l = -R^T q
     """
+    T, x_w = at
+    obs_kf, offset, place = seen
+    U, b_c, V, b_l, W = normal
     fx, fy, cx, cy = camera[0], camera[1], camera[2], camera[3]
     for lm in range(len(x_w)):
         px, py, pz = x_w[lm, 0], x_w[lm, 1], x_w[lm, 2]
@@ -142,30 +170,14 @@ def linearize(
 
 
 @kernel(error_model="numpy")
-def eliminate(
-    U: f8[:, :, ::1],
-    b_c: f8[:, ::1],
-    V: f8[:, :, ::1],
-    b_l: f8[:, ::1],
-    W: f8[:, :, ::1],
-    obs_kf: u8[::1],
-    offset: i8[::1],
-    place: i8[::1],
-    damping: f8,
-    hold: f8[::1],
-    block_of: i4[:, ::1],
-    S: f8[:, :, ::1],
-    rhs: f8[:, ::1],
-    V_inv: f8[:, ::1],
-    Y: f8[:, :, ::1],
-):
+def eliminate(normal: NormalEquations, seen: Sightings, damping: f8, hold: f8[::1], reduced: ReducedSystem):
     """Assemble the reduced camera system S dx_c = rhs, the Schur complement of the landmarks.
 
-    S (B, 6, 6), which holds 0 before, are the blocks on and above the diagonal, block_of (n, n) their numbers; on the diagonal only the
-    upper triangle holds.
-    damping multiplies the diagonals (Marquardt); hold (n,) is added to the key frames' diagonals. V_inv (L, 6) receives the upper
-    triangles of the inverses of the damped V, 0 where a landmark is not observed. Y : (most observations of a landmark, 6, 3) scratch.
+    damping multiplies the diagonals (Marquardt); hold (n,) is added to the key frames' diagonals. S is to hold 0 before.
     """
+    U, b_c, V, b_l, W = normal
+    obs_kf, offset, place = seen
+    block_of, S, rhs, V_inv, Y = reduced
     for f in range(len(U)):
         s = block_of[f, f]
         for i in range(6):
@@ -213,24 +225,20 @@ def eliminate(
 
 @kernel(error_model="numpy")
 def step(
-    T: f8[:, :, ::1],
-    x_w: f8[:, ::1],
-    U: f8[:, :, ::1],
-    b_c: f8[:, ::1],
-    V: f8[:, :, ::1],
-    b_l: f8[:, ::1],
-    W: f8[:, :, ::1],
+    at: Variables,
+    normal: NormalEquations,
     V_inv: f8[:, ::1],
-    obs_kf: u8[::1],
-    offset: i8[::1],
-    place: i8[::1],
+    seen: Sightings,
     damping: f8,
     hold: f8[::1],
     dx: f8[:, ::1],
-    T_new: f8[:, :, ::1],
-    x_new: f8[:, ::1],
+    to: Variables,
 ):
     """Back-substitute the landmarks, write the moved poses and landmarks; return the decrease of the cost to be expected."""
+    T, x_w = at
+    U, b_c, V, b_l, W = normal
+    obs_kf, offset, place = seen
+    T_new, x_new = to
     expected = 0.0
     for k in range(len(T)):
         for i in range(4):
@@ -264,11 +272,8 @@ def step(
 
 @kernel(error_model="numpy")
 def shared_gradient(
-    T: f8[:, :, ::1],
-    x_w: f8[:, ::1],
-    obs_kf: u8[::1],
-    offset: i8[::1],
-    place: i8[::1],
+    at: Variables,
+    seen: Sightings,
     measured: f8[:, ::1],
     camera: f8[::1],
     column: f8[:, ::1],
@@ -281,6 +286,8 @@ def shared_gradient(
 
     column (O, 3) : of J, the growth of u, v [px] and depth [m]. The rows of J_pose and J_landmark are those of `linearize`.
     """
+    T, x_w = at
+    obs_kf, offset, place = seen
     fx, fy = camera[0], camera[1]
     for lm in range(len(x_w)):
         px, py, pz = x_w[lm, 0], x_w[lm, 1], x_w[lm, 2]

@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from slamcli.estimation import bundle_kernels as kernels
+from slamcli.estimation.bundle_kernels import NormalEquations, ReducedSystem, Sightings, Variables
 from slamcli.estimation.reduced_camera_system import order_and_blocks
 from slamcli.estimation.relative_pose_factors import NO_EDGES, Edges, EdgeTerms
 from slamcli.estimation.robust_loss import CHI2_95_2DOF, CHI2_95_3DOF, HUBER, Huber
@@ -40,39 +41,11 @@ class Observations:
         return len(self.kf)
 
 
-class Variables(NamedTuple):
-    """What is adjusted."""
-
-    T_cw: np.ndarray  # (K, 4, 4)
-    x_w: np.ndarray  # (L, 3) m
-
-
 class Step(NamedTuple):
     """A damped Gauss-Newton step."""
 
     to: Variables
     decrease: float  # of the cost, as the linearized problem foretells it; NaN where its system is not positive definite
-
-
-class NormalEquations(NamedTuple):
-    """The blocks of the normal equations; of U and V the upper triangles alone, b is minus the gradient."""
-
-    U: np.ndarray  # (n, 6, 6) of the free key frames, by their left twists (rho, phi)
-    b_c: np.ndarray  # (n, 6)
-    V: np.ndarray  # (L, 3, 3) of the landmarks
-    b_l: np.ndarray  # (L, 3)
-    W: np.ndarray  # (O, 3, 6) landmark by key frame, of each observation
-
-    @classmethod
-    def empty(cls, n: int, n_landmarks: int, n_observations: int) -> "NormalEquations":
-        """Make blocks for n free key frames, to be filled."""
-        shapes = (n, 6, 6), (n, 6), (n_landmarks, 3, 3), (n_landmarks, 3), (n_observations, 3, 6)
-        return cls(*(np.empty(shape) for shape in shapes))
-
-    def clear(self) -> None:
-        """Set to 0 what is summed over observations."""
-        for block in (self.U, self.b_c, self.V, self.b_l):
-            block.fill(0.0)
 
 
 class Problem:
@@ -111,14 +84,15 @@ class Problem:
         self.hold = np.zeros(len(free))
         self.hold[self.place[free]] = np.where(n_seen[free] < FEW_OBSERVATIONS, HOLD, 0.0)
         self._edge_terms = EdgeTerms(edges, self.place, self.system.block_of)
-        self._offset = np.searchsorted(obs_lm, np.arange(len(x) + 1)).astype(np.int64)
+        offset = np.searchsorted(obs_lm, np.arange(len(x) + 1)).astype(np.int64)
         self.order = _stable_order(obs_lm * (len(T_cw) + 1) + self.place[obs_kf] + 1)
-        self.measured, self._obs_kf = measured[self.order], obs_kf[self.order].astype(np.uint64)
+        self.measured = measured[self.order]
+        self._seen = Sightings(obs_kf[self.order].astype(np.uint64), offset, self.place)
         self._camera = np.array([camera.fx, camera.fy, camera.cx, camera.cy], dtype=np.float64)
         self._loss, self._limits = loss, np.array(loss, dtype=np.float64)
         self.normal = NormalEquations.empty(len(free), len(x), len(obs_kf))
         self.rhs, self.V_inv = np.empty((len(free), 6)), np.empty((len(x), 6))
-        self._scratch = np.empty((int(np.diff(self._offset).max(initial=0)), 6, 3))
+        self._scratch = np.empty((int(np.diff(offset).max(initial=0)), 6, 3))
 
     # -- cost ---------------------------------------------------------------------------------------------------------------------
 
@@ -137,8 +111,8 @@ class Problem:
 
     def predict(self, at: Variables) -> np.ndarray:
         """Project the landmarks into the key frames that see them, (O, 3) u, v [px], depth [m]."""
-        lm = np.repeat(np.arange(len(at.x_w)), np.diff(self._offset))
-        T_of = at.T_cw[self._obs_kf.astype(np.int64)]
+        lm = np.repeat(np.arange(len(at.x_w)), np.diff(self._seen.offset))
+        T_of = at.T_cw[self._seen.kf.astype(np.int64)]
         x_c = np.einsum("oij,oj->oi", T_of[:, :3, :3], at.x_w[lm]) + T_of[:, :3, 3]
         z = np.maximum(x_c[:, 2], kernels.Z_MIN)
         fx, fy, cx, cy = self._camera
@@ -151,8 +125,8 @@ class Problem:
         return out
 
     def _evaluate(self, at: Variables, limits: np.ndarray) -> tuple[float, np.ndarray]:
-        chi2 = np.empty(len(self._obs_kf))
-        return kernels.evaluate(*at, self._obs_kf, self._offset, self.measured, self._camera, limits, chi2), chi2
+        chi2 = np.empty(len(self._seen.kf))
+        return kernels.evaluate(at, self._seen, self.measured, self._camera, limits, chi2), chi2
 
     # -- a step -------------------------------------------------------------------------------------------------------------------
 
@@ -160,8 +134,7 @@ class Problem:
         """Fill the normal equations; `measured` (O, 5) stands in for what was measured."""
         self.normal.clear()
         measured = self.measured if measured is None else measured
-        observations = (self._obs_kf, self._offset, self.place, measured, self._camera, self._limits)
-        kernels.linearize(*at, *observations, *self.normal)
+        kernels.linearize(at, self._seen, measured, self._camera, self._limits, self.normal)
         self._edge_terms.linearize(at.T_cw, self._loss.is_robust, self.normal.U, self.normal.b_c)
 
     def eliminate(self, damping: float, hold: np.ndarray) -> None:
@@ -170,8 +143,8 @@ class Problem:
         damping : factor on their diagonal (Marquardt); hold : (n,) added to the key frames'
         """
         self.system.blocks.fill(0.0)
-        blocks = (*self.normal, self._obs_kf, self._offset, self.place)
-        kernels.eliminate(*blocks, damping, hold, self.system.block_of, self.system.blocks, self.rhs, self.V_inv, self._scratch)
+        reduced = ReducedSystem(self.system.block_of, self.system.blocks, self.rhs, self.V_inv, self._scratch)
+        kernels.eliminate(self.normal, self._seen, damping, hold, reduced)
         self._edge_terms.add_to(self.system.blocks)
 
     def shared_gradients(self, used: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -182,9 +155,8 @@ class Problem:
         """
         per_number = np.ascontiguousarray(columns.transpose(2, 0, 1))
         reduced, lifted = np.zeros((len(per_number), *self.rhs.shape)), np.zeros((len(per_number), *self.normal.b_l.shape))
-        seen = (self._obs_kf, self._offset, self.place, used, self._camera)
         for g, column in enumerate(per_number):
-            kernels.shared_gradient(*self.start, *seen, column, self.normal.W, self.V_inv, reduced[g], lifted[g])
+            kernels.shared_gradient(self.start, self._seen, used, self._camera, column, self.normal.W, self.V_inv, reduced[g], lifted[g])
         return reduced.reshape(len(reduced), -1), lifted
 
     def step(self, at: Variables, damping: float) -> Step:
@@ -195,8 +167,7 @@ class Problem:
             return Step(at, np.nan)
         dx_c = factor.solve(self.rhs.ravel()).reshape(-1, 6)
         to = Variables(np.empty_like(at.T_cw), np.empty_like(at.x_w))
-        blocks = (*self.normal, self.V_inv, self._obs_kf, self._offset, self.place)
-        return Step(to, kernels.step(*at, *blocks, damping, self.hold, dx_c, *to))
+        return Step(to, kernels.step(at, self.normal, self.V_inv, self._seen, damping, self.hold, dx_c, to))
 
 
 def _stable_order(key: np.ndarray) -> np.ndarray:

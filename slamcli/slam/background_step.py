@@ -18,6 +18,7 @@ from slamcli.config.options import SensorConfig
 from slamcli.depth import icp, icp_kernels
 from slamcli.depth.coarse_images import CoarseImages
 from slamcli.depth.icp import OrientedPoints, Pass, PosePrior
+from slamcli.depth.icp_kernels import NormalEquations
 from slamcli.estimation import camera_pose, minimal_solvers
 from slamcli.estimation.camera_pose import PoseEstimate
 from slamcli.estimation.measurements import Measurements
@@ -219,12 +220,10 @@ def _explain(T: np.ndarray, source: OrientedPoints, target: OrientedPoints) -> t
 def _align(T: np.ndarray, source: OrientedPoints, target: OrientedPoints, prior: PosePrior) -> np.ndarray:
     """Move the source's surface onto the target's, all surface counting alike; `prior` as in icp.align."""
     T = np.array(T, dtype=np.float64, order="C")
-    H, b = np.zeros((6, 6)), np.zeros(6)
     pull = product(prior.information, se3.log(product(prior.T, se3.inverse(T))))
-    icp_kernels.align(
-        T, source.xyz, source.normal, _variance(source), target.row, target.xyz, target.normal, _variance(target), target.pinhole,
-        SCHEDULE, icp.MIN_COSINE, icp.HUBER_CHI2, icp.READINGS_AS_ONE, np.ascontiguousarray(prior.information), pull, H, b,
-    )  # fmt: skip
+    by_surface = (one.points._replace(variance=_variance(one)) for one in (source, target))
+    known, found = NormalEquations(np.ascontiguousarray(prior.information), pull), NormalEquations(np.zeros((6, 6)), np.zeros(6))
+    icp_kernels.align(T, *by_surface, target.view, SCHEDULE, icp.RULE, known, found)
     return se3.orthonormalize(T)
 
 
