@@ -26,6 +26,7 @@ from slamcli.schema import Grid
 MAX_CELLS = 1 << 25  # 290 m x 290 m at 0.05 m: some 600 MB of work arrays
 MAX_WINDOW = 4000  # cells within reach of one view: 110 MB
 DEEPEST = 1.0  # [m] how far something that hangs may go on behind the face that was seen
+BESIDE = 0.15  # [m] from the seen faces of something that hangs, within which it may go on to the side
 FAR_EDGE = 0.3  # [m] before a hole's far edge in which the wall below it ends the lines of sight
 TOP_SLICE = 1 << (SLICES - 1)
 INSIDE = 0.9  # P(F) of a cell that was never seen but must lie within something that hangs
@@ -109,10 +110,12 @@ def fuse(views: Iterable[View], *, settings: GridConfig, floor: Terrain = LEVEL_
         n_under[sight.rows[is_under], sight.columns[is_under]] += 1
         n_top[sight.rows[view.is_top], sight.columns[view.is_top]] += 1
     things = hanging.find(standing & hangs, widest=DEEPEST / settings.resolution)
+    is_doubtful = _beside_hanging(standing & hangs, is_open, settings.resolution)
     update = paper_update if settings.update == "paper" else evidence_update
     for view, sight in zip(views, sights, strict=True):
         is_free = (view.floor != NOT_SEEN) & ~is_hole[sight.rows, sight.columns]
         _drop_hidden(is_free, outline, is_open, hangs, things.face, things.around, ground, sight)
+        is_free &= ~is_doubtful[sight.rows, sight.columns]
         told = is_free | (view.n_band >= settings.n_low)
         update(p_empty, n_seen, sight.rows[told], sight.columns[told], view.n_band[told], settings)
     p_occupied = (1.0 - p_empty).astype(np.float32)
@@ -233,6 +236,27 @@ def _with_neighbours(standing: np.ndarray) -> np.ndarray:
     """Add to each cell the slices of the four beside it: a line of sight must not slip through a gap of one cell in an outline."""
     padded = np.pad(standing, 1)
     return standing | padded[:-2, 1:-1] | padded[2:, 1:-1] | padded[1:-1, :-2] | padded[1:-1, 2:]
+
+
+def _beside_hanging(hangs: np.ndarray, is_open: np.ndarray, resolution: float) -> np.ndarray:
+    """Say which cells (H, W) are so near to something that hangs that it may go on over them, while no line of sight crossed its heights there.
+
+    A side that is seen at a grazing angle, or from too near, shows nothing, and the floor under the thing is seen past it.
+
+    hangs, is_open : (H, W) uint16, bits: slices of the band that hang, and that lines of sight crossed
+    """
+    import cv2
+
+    # The lowest and the highest slice may be filled in part; what is above the band goes on.
+    core = hangs & (hangs << 1) & ((hangs >> 1) | (hangs & TOP_SLICE))
+    reach = int(np.ceil(BESIDE / resolution))
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1,) * 2)
+    heights = np.zeros_like(hangs)  # of what hangs around
+    for slice_ in range(SLICES):
+        is_here = (core >> slice_) & 1
+        if is_here.any():
+            heights |= cv2.dilate(is_here.astype(np.uint8), disc).astype(np.uint16) << slice_
+    return (heights > 0) & (is_open & heights == 0)
 
 
 def extent(views: list[View], resolution: float) -> tuple[np.ndarray, tuple[int, int]]:

@@ -16,6 +16,7 @@ GROWTH = 0.6  # [cells] by which a rectangle through the middles of cells is gro
 MARGIN = 4.0  # [cells] by which a thing may be larger than what was seen of its sides
 DEEP = 5.0  # [cells] a narrower rectangle may be of one face and what stands beside it
 COVERED = 0.75  # of two sides' length that must have been seen for their ends to be the thing's
+FILLED = 0.6  # of a rectangle's cells that must have been seen for it to be the thing's, whichever of its sides were
 ANGLE_STEP = 2.0  # [degrees] between rectangles that are tried
 CLOSEST = 0.5  # [cells] a point nearer to a side counts no more: it is the cell's middle
 SHALLOWEST = 3.0  # [cells] a narrower rectangle is around one face, which does not tell how deep its thing is
@@ -55,7 +56,7 @@ def find(hangs: np.ndarray, *, widest: float) -> Things:
         if min(rectangle.sides) < SHALLOWEST or max(rectangle.sides) > widest:
             continue
         _fill(inside, rectangle, margin=GROWTH, value=True)
-        if min(rectangle.sides) >= DEEP and are_sides_covered(rectangle, xy):
+        if min(rectangle.sides) >= DEEP and (are_sides_covered(rectangle, xy) or is_filled(rectangle, xy)):
             face[label == k] = k
             _fill(around, rectangle, margin=MARGIN, value=k)
     distance = cv2.distanceTransform((~is_face).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
@@ -100,6 +101,11 @@ def are_sides_covered(rectangle: Rectangle, xy: np.ndarray) -> bool:
             cells = len(np.unique(np.floor(local[on_side, along])))
             is_covered.append(cells >= COVERED * rectangle.sides[along])
     return bool((is_covered[0] or is_covered[1]) and (is_covered[2] or is_covered[3]))
+
+
+def is_filled(rectangle: Rectangle, xy: np.ndarray) -> bool:
+    """Say whether points (N, 2), each a cell, fill a rectangle: what was seen from above, as the seat of a chair, shows where it ends."""
+    return len(xy) >= FILLED * float(rectangle.sides[0] * rectangle.sides[1])
 
 
 def _fill(cells: np.ndarray, rectangle: Rectangle, *, margin: float, value: int) -> None:

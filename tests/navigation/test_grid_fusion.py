@@ -159,6 +159,20 @@ def test_an_outline_is_closed_by_the_four_cells_beside_each_and_no_others():
     np.testing.assert_array_equal(grid._with_neighbours(standing), expected)
 
 
+@pytest.mark.parametrize(
+    ("x", "n_views", "slices", "expected"),
+    [(8, 0, 0, UNKNOWN), (8, 1, 0x4000, UNKNOWN), (8, 2, 0x4000, FREE), (8, 2, 0x0FFF, UNKNOWN), (7, 0, 0, UNKNOWN), (6, 0, 0, FREE)],
+)
+def test_floor_close_beside_what_hangs_is_free_only_where_lines_of_sight_crossed_its_heights(x, n_views, slices, expected):
+    """BESIDE is three cells. A side seen at too flat an angle shows nothing, while the floor under the thing is seen past its front."""
+    aside = ((x + 0.5) * 0.05, 40.5 * 0.05, 0.6)  # from here no line passes under the face
+    below = view([[10, 3], [10, 4], [10, 5]], floor=SEEN, camera=CAMERA)
+    beside = view([[x, 4]], floor=SEEN, camera=aside)
+    crossing = view([[20, 8]], camera=CAMERA, crossed=(np.array([[x, 4]], np.int32), np.array([slices], np.uint16)))
+    made = fuse([FACE, below, beside] * 3 + [crossing] * n_views, settings=SETTINGS)
+    assert made.state[4, x - round(float(made.origin[0]) / 0.05)] == expected
+
+
 def test_frames_stand_as_far_apart_or_as_much_turned_as_asked_for():
     T = np.tile(np.eye(4), (4, 1, 1))
     T[1, 0, 3], T[2, :2, 3], T[3, :3, 3] = 0.14, [0.12, 0.12], [0.12, 0.12, 0.14]

@@ -143,6 +143,16 @@ def test_a_thing_seen_from_one_side_is_not_filled():
     assert not hanging.find(np.kron(hangs, np.ones((3, 3), np.uint16)), widest=20.0).inside.any()  # too large for one thing
 
 
+def test_a_thing_seen_all_over_from_above_has_the_outline_seen_whichever_of_its_sides_were():
+    hangs = np.zeros((40, 40), np.uint16)
+    hangs[10:19, 10:19] = 0x8000
+    hangs[10:13, 10:13] = hangs[16:19, 10:13] = hangs[10:13, 16:19] = hangs[16:19, 16:19] = 0
+    things = hanging.find(hangs, widest=20.0)
+    assert (things.face[12:17, 12:17] > 0).all()
+    hangs[12:17, 12:17] = 0
+    assert not hanging.find(hangs, widest=20.0).face.any(), "nor were its sides"
+
+
 def test_poses_in_any_frame_give_the_same_hazards():
     upper, pit = ((0.0, 0.0, -0.5), (4.0, 5.0, 0.0)), ((0.0, 0.0, -0.5), (8.0, 5.0, 2.5))
     T = drive(1.0, 3.4)
