@@ -1,25 +1,32 @@
-"""Whether two map segments can be one place: what both of them saw must be the same, in shape and in picture.
+"""Whether two parts of a map can be one place: what both of them saw must be the same, in shape and in picture.
 
 Several closures that agree are not enough to join recordings of different houses: makers repeat doors, posters and furniture, and such
 things stand in the same way to each other wherever they are. But under a wrong placement much of what one recording shows lies in space
-that the other looks through, and views from nearly the same spot show different pictures.
+that the other looks through, and views from nearly the same spot show different pictures. Two corridors of equal doors differ at their ends
+alone, which few of the views show: so pictures are compared place by place, too.
+
+Within a recording, odometry speaks against a wrong place, but less and less the longer the way between: along a corridor of equal doors it
+does not tell one from the next. So a closure that moves its view far has the views around it compared in the same way.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from slamcli.config.options import LoopConfig
+from slamcli.depth import icp
 from slamcli.depth.coarse_images import CoarseImages
-from slamcli.geometry import se3
+from slamcli.geometry import depth_noise, se3
 from slamcli.geometry.algebra import product
 from slamcli.slam import moving_object_kernels as kernels
 from slamcli.slam import moving_objects
 from slamcli.slam.loop_candidates import Candidate
-from slamcli.slam.loop_verification import find_again
+from slamcli.slam.loop_verification import MAX_DISTANCE, RATIO, WIDENINGS, find_again
 from slamcli.slam.map_merging import Join
 from slamcli.slam.moving_objects import Views
+from slamcli.sparse_map import guided_matching, landmark_pose
 from slamcli.sparse_map.frame import FrameStore
+from slamcli.sparse_map.guided_matching import SearchLimits
 from slamcli.sparse_map.sparse_map import SparseMap
 
 AHEAD = 2.0  # [m] before a camera, what it looks at
@@ -29,6 +36,13 @@ NEAR_M, NEAR_COSINE = 0.5, 0.94  # apart, views whose pictures must be alike
 MOST_PAIRS = 60  # of these, evenly spread, are compared
 LEAST_AGREEMENT = 0.8  # of the surface that both saw
 LEAST_ALIKE = 0.5  # of the pairs of near views
+PLACE = 1.0  # [m] side of the cubes that pictures are compared in
+LEAST_EXPECTED = 100  # landmarks that views of a place should show, before it says anything
+# Share of these that is found, beside the share over all places. Of one place, the least alike had 0.39 of it; of two corridors that differ
+# at their ends, two places or more 0 to 0.2. One such place is no objection: a picture on a wall may have been changed.
+OTHERWISE, MOST_OTHERWISE = 0.2, 1
+WINDOW = 25  # key frames before and after each side of a closure, that are compared
+MOVED_M, MOVED_RAD = 0.3, 0.1  # a closure that moves its view by less is one of a place that odometry knows
 
 
 @dataclass(frozen=True)
@@ -36,17 +50,33 @@ class Evidence:
     """What two segments say of one another under a placement."""
 
     agreement: float  # share of the surface that the other segment sees again, of that which it sees again or looks through
-    n_pairs: int  # pairs of views from nearly the same spot
-    n_alike: int  # of these, pairs in which one shows the landmarks of the other
+    n_pairs: int = 0  # pairs of views from nearly the same spot
+    n_alike: int = 0  # of these, pairs in which one shows the landmarks of the other
+    n_otherwise: int = 0  # places whose surface both saw, but hardly one landmark of the other
 
     @property
     def objection(self) -> str:
         """Say why the two cannot be one place, "" when they can."""
         if not self.agreement >= LEAST_AGREEMENT:
-            return f"the other recording looks through {1.0 - self.agreement:.0%} of what would be one surface"
+            return f"one side looks through {1.0 - self.agreement:.0%} of what would be one surface"
         if self.n_alike < LEAST_ALIKE * self.n_pairs:
             return f"{self.n_pairs - self.n_alike} of {self.n_pairs} pairs of views from nearly one spot show different things"
+        if self.n_otherwise > MOST_OTHERWISE:
+            return f"{self.n_otherwise} places of {PLACE:g} m look different from the two sides, though their surfaces would be the same"
         return ""
+
+
+def count_otherwise(place: np.ndarray, is_found: np.ndarray) -> int:
+    """Count the places at which hardly any of the landmarks that should be seen were found, beside the share that was found everywhere.
+
+    place : (N, 3) whole numbers, of each landmark that a view should show; is_found : (N,) bool
+    """
+    if not len(place):
+        return 0
+    _, at = np.unique(place, axis=0, return_inverse=True)
+    n_expected, n_found = np.bincount(at.ravel()), np.bincount(at.ravel(), weights=is_found)
+    share = float(np.mean(is_found))
+    return int(np.count_nonzero((n_expected >= LEAST_EXPECTED) & (n_found < OTHERWISE * share * n_expected)))
 
 
 class Jury:
@@ -62,15 +92,37 @@ class Jury:
 
     def weigh(self, found: Join) -> Evidence:
         """Compare the views of two segments under a placement of one to the other."""
-        kf = self._sparse_map.kf
-        a, b = (np.flatnonzero(kf.segment == segment) for segment in (found.a, found.b))
-        T_ak = np.array(kf.T_wk)
-        T_ak[b] = product(found.T_ab, T_ak[b])
+        segment = self._sparse_map.kf.segment
+        return self._weigh(np.flatnonzero(segment == found.a), np.flatnonzero(segment == found.b), found.T_ab)
+
+    def objection_to_closure(self, closure: Candidate) -> str:
+        """Say why the two sides of a verified closure within a segment cannot be one place, "" when they can, or when it moves its view little."""
+        assert closure.T_ij is not None, "only a verified closure has a pose"
+        kf, i, j = self._sparse_map.kf, closure.kf_i, closure.kf_j
+        T_wi = product(kf.T_wk[j], se3.inverse(closure.T_ij))
+        move = product(T_wi, se3.inverse(kf.T_wk[i]))
+        moved = se3.log(product(se3.inverse(kf.T_wk[i]), T_wi))
+        if np.linalg.norm(moved[:3], axis=-1) < MOVED_M and np.linalg.norm(moved[3:], axis=-1) < MOVED_RAD:
+            return ""
+        reach = min(WINDOW, (i - j) // 2)
+        rows = np.flatnonzero(kf.segment == kf.segment[i])
+        a, b = (rows[np.abs(rows - side) <= reach] for side in (j, i))
+        return self._weigh(a, b[b > a[-1]], move).objection
+
+    def _weigh(self, a: np.ndarray, b: np.ndarray, T_ab: np.ndarray) -> Evidence:
+        """Compare the views of key frames b, moved by T_ab, with those of key frames a, until something speaks against the motion."""
+        T_ak = np.array(self._sparse_map.kf.T_wk)
+        T_ak[b] = product(T_ab, T_ak[b])
         spot = T_ak[:, :3, 3] + AHEAD * T_ak[:, :3, 2]
         apart = np.linalg.norm(spot[b][:, None] - spot[a], axis=2)
-        agreement = self._agreement(T_ak, a, b, apart)
-        pairs = self._near_pairs(T_ak, a, b)
-        return Evidence(agreement, len(pairs), sum(self._are_alike(T_ak, *pair) for pair in pairs))
+        evidence = Evidence(self._agreement(T_ak, a, b, apart))
+        if not evidence.objection:
+            pairs = self._near_pairs(T_ak, a, b)
+            evidence = replace(evidence, n_pairs=len(pairs), n_alike=sum(self._are_alike(T_ak, *pair) for pair in pairs))
+        if not evidence.objection:
+            looks = [(pair, np.eye(4)) for pair in pairs] + [(pair, T_ab) for pair in self._near_pairs(T_ak, b, a)]
+            evidence = replace(evidence, n_otherwise=self._otherwise(T_ak, looks))
+        return evidence
 
     def _agreement(self, T_ak: np.ndarray, a: np.ndarray, b: np.ndarray, apart: np.ndarray) -> float:
         n, frame = len(self._depth), self._sparse_map.kf.frame
@@ -100,3 +152,46 @@ class Jury:
     def _are_alike(self, T_ak: np.ndarray, i: int, j: int) -> bool:
         T_ia = se3.inverse(T_ak[i])  # j stands in the world of a already
         return find_again(self._sparse_map, Candidate(i, j, 0.0), T_ia, self._frames, self._settings).is_accepted
+
+    def _otherwise(self, T_ak: np.ndarray, looks: list[tuple[tuple[int, int], np.ndarray]]) -> int:
+        """Count the places of which near views show the same surface but other landmarks.
+
+        looks : key frames (i, j) of different parts, and the motion (4, 4) of the world that j stands in to that of part a
+        """
+        places, finds = [np.zeros((0, 3), dtype=np.int64)], [np.zeros(0, dtype=bool)]
+        for (i, j), T_aj in looks:
+            x_a, is_expected, is_found = self._looked_for(T_ak, i, j, T_aj)
+            places.append(np.floor(x_a[is_expected] / PLACE).astype(np.int64))
+            finds.append(is_found[is_expected])
+        return count_otherwise(np.concatenate(places), np.concatenate(finds))
+
+    def _looked_for(self, T_ak: np.ndarray, i: int, j: int, T_aj: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Look in key frame i for the landmarks that key frame j shows.
+
+        Returns the landmarks (N, 3) in the world of part a, whether i should show each, having its surface in view, and whether it does.
+        """
+        kf = self._sparse_map.kf
+        landmarks = self._sparse_map.landmarks(self._sparse_map.landmarks_of(j))
+        frame = self._frames[int(kf.frame[i])]
+        limits = SearchLimits(self._settings.search_radius_px, MAX_DISTANCE, RATIO)
+        T_iw, wanted = product(se3.inverse(T_ak[i]), T_aj), self._settings.min_inliers
+        shown = landmark_pose.find(T_iw, landmarks, frame, limits.widened(WIDENINGS[-1]), wanted=wanted)
+        if shown.estimate is not None:  # from the pose that the first look gives, a narrow window tells more
+            T_iw = shown.estimate.T_cw
+            shown = landmark_pose.find(T_iw, landmarks, frame, limits, wanted=wanted)
+        is_found = np.zeros(len(landmarks.xyz), dtype=bool)
+        is_found[shown.landmark] = True
+        is_expected = shown.is_visible & self._shows_surface(int(kf.frame[i]), se3.transform(T_iw, landmarks.xyz))
+        return se3.transform(T_aj, landmarks.xyz), is_expected, is_found
+
+    def _shows_surface(self, frame: int, x_c: np.ndarray) -> np.ndarray:
+        """Say at which of the points (N, 3) [m], in the frame's camera, its depth image shows a surface."""
+        small, row_at = icp.coarse_camera(self._frames.camera)
+        raw = np.append(self._depth[frame].ravel(), np.uint16(0))
+        depth = raw[np.where(row_at < small.width * small.height, row_at, -1)] * icp.UNIT  # -1 takes the 0 at the end
+        z = np.maximum(x_c[:, 2], guided_matching.NEAREST)
+        u, v = np.rint(np.column_stack([x_c[:, 0] / z * small.fx + small.cx, x_c[:, 1] / z * small.fy + small.cy])).astype(np.int64).T
+        is_in = (u >= 0) & (u < small.width) & (v >= 0) & (v < small.height)
+        there = np.where(is_in, depth[v.clip(0, small.height - 1), u.clip(0, small.width - 1)], 0.0)
+        base, share, growth = moving_objects.TOLERANCE
+        return (there > 0.0) & (np.abs(there - z) < base + share * z + growth * np.maximum(z - depth_noise.BEST, 0.0) ** 2)

@@ -23,6 +23,11 @@ def no_objection(found: Join) -> str:
     return ""
 
 
+def no_doubt(closure: Candidate) -> str:
+    """Object to no closure."""
+    return ""
+
+
 class LoopCloser:
     """Changes a map so that places seen again coincide; `fate` says of every pair of key frames that was tried what became of it."""
 
@@ -36,13 +41,15 @@ class LoopCloser:
         *,
         progress: Callable[..., Iterable],
         objection: Callable[[Join], str] = no_objection,
+        doubt: Callable[[Candidate], str] = no_doubt,
     ) -> None:
         """Take the map with the words and frames of the recording that it is of.
 
-        progress : wraps the candidates while they are verified; objection : says why two segments cannot be one place, "" when they can
+        progress : wraps the candidates while they are verified
+        objection, doubt : say why two segments, and the two sides of a verified closure within one, cannot be one place, "" when they can
         """
         self._sparse_map, self._words, self._frames, self._settings, self._rng = sparse_map, words, frames, settings, rng
-        self._progress, self._objection = progress, objection
+        self._progress, self._objection, self._doubt = progress, objection, doubt
         self._places = PlaceIndex(words, sparse_map.kf.frame)
         self.fate: dict[tuple[int, int], Candidate] = {}
 
@@ -64,8 +71,10 @@ class LoopCloser:
         tried = [self._verified(c) for c in find_alike(self._sparse_map, self._places, self._settings) if self._is_between_segments(c)]
         left = [c for c in tried if c.is_accepted]
         self._note(c for c in tried if not c.is_accepted)
-        while found := map_merging.find_join(self._sparse_map, left, least=self._settings.join_closures):
+        refused: list[Join] = []
+        while found := map_merging.find_join(self._sparse_map, left, least=self._settings.join_closures, refused=refused):
             if reason := self._objection(found):
+                refused.append(found)
                 claims = {(c.kf_i, c.kf_j) for c in found.closures}
                 self._note(c.rejected(reason) for c in found.closures)
                 left = [c for c in left if (c.kf_i, c.kf_j) not in claims]
@@ -95,6 +104,8 @@ class LoopCloser:
             if closed.cover(candidate) or (not candidate.is_by_pose and contradicted.cover(candidate)):
                 continue
             verified = self._verified(candidate)
+            if verified.is_accepted and (reason := self._doubt(verified)):
+                verified = verified.rejected(reason)
             self._note([verified])
             if verified.is_accepted:
                 accepted.append(verified)

@@ -1,5 +1,6 @@
 """Map merging: two segments of a map that saw the same place are joined."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -25,21 +26,30 @@ class Join:
     support: int  # landmarks that the closures found again
 
 
-def find_join(sparse_map: SparseMap, closures: list[Candidate], *, least: int) -> Join | None:
+def find_join(sparse_map: SparseMap, closures: list[Candidate], *, least: int, refused: Sequence[Join] = ()) -> Join | None:
     """Find the two segments for which the most speaks; None where fewer than `least` closures agree on how two segments lie.
 
     closures : verified, each between two segments
+    refused : joins that cannot be, with closures of their own: they show that these places repeat themselves, and speak against any
+        other placement of the same two segments
 
     One closure between segments stands alone: no odometry runs between them that could contradict it. So several have to say the same,
     and no others that say otherwise may come near them in weight, as they do where places look alike.
     """
     segment = sparse_map.kf.segment
     pairs = sorted({tuple(sorted((int(segment[c.kf_i]), int(segment[c.kf_j])))) for c in closures})
-    found = [_between(sparse_map, closures, a, b) for a, b in pairs]
+    found = [_between(sparse_map, closures, a, b, _support_of_refused(sparse_map, refused, a, b)) for a, b in pairs]
     return max((j for j in found if j is not None and len(j.closures) >= least), key=lambda j: j.support, default=None)
 
 
-def _between(sparse_map: SparseMap, closures: list[Candidate], a: int, b: int) -> Join | None:
+def _support_of_refused(sparse_map: SparseMap, refused: Sequence[Join], a: int, b: int) -> int:
+    """Return the support of the strongest refused join between what now are segments a and b."""
+    segment = sparse_map.kf.segment
+    between = (join for join in refused if {int(segment[kf]) for c in join.closures for kf in (c.kf_i, c.kf_j)} == {a, b})
+    return max((join.support for join in between), default=0)
+
+
+def _between(sparse_map: SparseMap, closures: list[Candidate], a: int, b: int, rival_before: int) -> Join | None:
     """Find what most closures between segments a and b say of how they lie; None where others contradict them."""
     segment = sparse_map.kf.segment
     here = [c for c in closures if {int(segment[c.kf_i]), int(segment[c.kf_j])} == {a, b}]
@@ -54,7 +64,7 @@ def _between(sparse_map: SparseMap, closures: list[Candidate], a: int, b: int) -
     weight = np.array([c.n_inliers for c in between])
     m = int(np.argmax(product(agrees, weight)))
     support, rival = int(product(agrees[m], weight)), int((product(agrees & ~agrees[m], weight))[~agrees[m]].max(initial=0))
-    if support < OUTWEIGH * rival:
+    if support < OUTWEIGH * max(rival, rival_before):
         return None
     return Join(a, b, T_ab[m], [c for c, is_one in zip(here, agrees[m], strict=True) if is_one], support)
 

@@ -84,8 +84,12 @@ def close_loops(
     if not cfg.loop.enabled or len(sparse_map.kf) <= FEWEST_KEY_FRAMES:
         return []
     words = inputs.load(Words, "match")
-    objection = Jury(sparse_map, depth, frames, cfg.loop).objection if are_several else no_objection
-    return LoopCloser(sparse_map, words, frames, cfg.loop, tools.rng(), progress=tools.progress, objection=objection).close_loops()
+    jury = Jury(sparse_map, depth, frames, cfg.loop)
+    closer = LoopCloser(
+        sparse_map, words, frames, cfg.loop, tools.rng(), progress=tools.progress,
+        objection=jury.objection if are_several else no_objection, doubt=jury.objection_to_closure,
+    )  # fmt: skip
+    return closer.close_loops()
 
 
 def look_again(

@@ -223,6 +223,18 @@ def test_what_looks_alike_in_two_places_joins_nothing(n_inliers, is_joined):
     assert (found is not None) == is_joined
 
 
+@pytest.mark.parametrize(("n_inliers", "is_joined"), [(89, False), (180, True)])
+def test_a_refused_join_speaks_against_any_weaker_placement_of_the_same_segments(n_inliers, is_joined):
+    """The place repeats itself: what is left when the strongest placement cannot be is no more than its like next door."""
+    sparse_map, T_gc, _ = two_segments(np.random.default_rng(3))
+    refused = map_merging.find_join(sparse_map, [measured(T_gc, 3, 1), measured(T_gc, 4, 1, n_inliers=89)], least=2)
+    left = [measured(T_gc, i, 2, n_inliers=n_inliers) for i in (4, 5)]
+    assert map_merging.find_join(sparse_map, left, least=2) is not None
+    assert (map_merging.find_join(sparse_map, left, least=2, refused=[refused]) is not None) == is_joined
+    sparse_map.kf.segment[2:4] = 2
+    assert map_merging.find_join(sparse_map, left, least=1, refused=[refused]) is not None, "it was between other segments"
+
+
 def test_segments_are_numbered_by_their_frames():
     none = np.empty(0, np.int32)
     map_ = Map(
