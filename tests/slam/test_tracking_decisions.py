@@ -8,7 +8,7 @@ from scenes import Scene, observe, orbit, room_points, sweep
 
 from slamcli.config.options import SensorConfig, TrackConfig
 from slamcli.geometry import se3
-from slamcli.schema import KEY_FRAME, LOST, ON_DEPTH, RELOCALIZED, TRACKED, frame_poses, frame_segments
+from slamcli.schema import KEY_FRAME, LOST, ON_DEPTH, RELOCALIZED, TRACKED, Rests, frame_poses, frame_segments
 from slamcli.slam import background_prior
 from slamcli.slam.depth_localization import DepthMatch
 from slamcli.slam.localizer import nothing_seen
@@ -68,6 +68,7 @@ def test_the_rule_is_told_what_a_frame_sees_of_what():
     assert 0 < sighting.n_near_landmarks < sighting.n_landmarks
     assert sighting.n_near_landmarks + sighting.n_near_new == has_depth.sum()
     assert sighting.n_near_new == has_depth[landmark < 0].sum()
+    assert tracker._sighting(6, frame, np.zeros_like(landmark)).n_landmarks == len(landmark), "the first landmark counts like any other"
     sparse_map = tracker._sparse_map
     of_reference = sparse_map.landmarks_of(int(tracker.tracks().ref_kf[6]))
     assert sighting.n_reference == (sparse_map.lm.n_obs[of_reference] >= 2).sum() < len(of_reference)
@@ -82,6 +83,28 @@ def test_of_the_only_key_frame_all_landmarks_count_and_another_segments_crowd_do
     assert sighting.n_reference == len(tracker._sparse_map.landmarks_of(0)) > 150 and sighting.n_crowd == 1
     tracker._sparse_map.add_key_frame(0, np.eye(4), segment=1)
     assert tracker._sighting(1, frame, landmark).n_crowd == 1
+
+
+def resting(*, first: int = 4, blind: tuple[int, ...] = ()) -> tuple[Scene, KnownMotion]:
+    """A sweep of twelve frames with a rest from frame `first` to frame 8."""
+    path = sweep(12)
+    path[first + 1 : 9] = path[first]
+    return seen(path, blind=blind), KnownMotion(stands_still=Rests(np.array([[first, 8]], np.int32)))
+
+
+def test_the_last_frame_of_a_rest_is_located_for_the_landmarks_that_the_next_one_is_tracked_by():
+    scene, motion = resting()
+    within, last = (track(scene, motion=motion, until=n)._previous.landmark for n in (8, 9))
+    assert (within < 0).all() and (last >= 0).sum() > 50
+
+
+@pytest.mark.parametrize("blind", [(4,), (5, 6, 7), (7,)])
+def test_where_a_rest_begins_lost_its_frames_are_looked_for(blind: tuple[int, ...]):
+    """None is said to stand where a lost one does, neither within the rest nor at its end."""
+    scene, motion = resting(first=blind[0], blind=blind)
+    tracks, after = track(scene, motion=motion).tracks(), blind[-1] + 1
+    assert (tracks.state[list(blind)] == LOST).all() and (tracks.state[after:] != LOST).all()
+    assert (tracks.ref_kf[after:] >= 0).all() and np.isfinite(tracks.T_kc[after:]).all()
 
 
 def lost_and_back(*parts: tuple[str, int], blind: bool = False) -> tuple[Scene, np.ndarray]:
