@@ -21,6 +21,7 @@ from slamcli.schema import Grid
 SUBCELLS = 5  # samples along a cell's side
 ON_FLOOR = 1e-6  # [m]
 OUTLINE_POINTS = 3  # points of the band a cell must have shown to count as a seen outline
+BEFORE = 0.15  # share of the true depth by which a reading is nearer at most: at edges and far off noise takes a tenth
 LARGEST = 1e6  # [m] of a scene, so that no square overflows
 SPECIAL = ("hanging_box", "low_box")
 
@@ -119,11 +120,16 @@ def _through_cylinder(start: np.ndarray, ray: np.ndarray, radius: float, height:
 
 
 def exact_points(scene: Scene, depth: np.ndarray, T_sk: np.ndarray, camera: Camera, *, max_range: float, stride: int = 4) -> np.ndarray:
-    """Return the points (N, 3) that every `stride`-th pixel with a reading up to max_range [m] truly showed."""
+    """Return the points (N, 3) that every `stride`-th pixel with a reading up to max_range [m] truly showed.
+
+    A reading far before all of the scene shows what is no part of it, such as somebody who walks by.
+    """
     seen = depth[::stride, ::stride] <= max_range
     rays = camera.rays[::stride, ::stride][seen].astype(np.float64)
     ray = np.column_stack([rays, np.ones(len(rays))]) @ T_sk[:3, :3].T
-    return T_sk[:3, 3] + ray * cast(scene, T_sk[:3, 3], ray)[:, None]
+    true = cast(scene, T_sk[:3, 3], ray)
+    shows = depth[::stride, ::stride][seen] > (1.0 - BEFORE) * true
+    return T_sk[:3, 3] + ray[shows] * true[shows, None]
 
 
 @dataclass(frozen=True)

@@ -29,6 +29,7 @@ class BackgroundMotion:
     ) -> None:
         """Take the features, their words and the coarse depth images of a recording."""
         self._stamp = features.stamp
+        self._shows_depth = np.array([bool(depth[frame].any()) for frame in range(len(features.stamp))], dtype=bool)
         self._steps = StepFinder(features, words, depth, camera, sensor, rng)
 
     def poses(self, progress: Callable[[range], Iterable[int]] = iter, *, before: np.ndarray | None = None) -> np.ndarray:
@@ -36,7 +37,7 @@ class BackgroundMotion:
 
         before : what an earlier round estimated, whose motions are tried too
         """
-        anchors = anchor_frames(self._stamp)
+        anchors = anchor_frames(self._stamp, self._shows_depth)
         steps, scale = list[list[Judgement]](), list[float]()
         for k in progress(range(1, len(anchors))):
             scale.append(self._lasts(anchors, k) / self._lasts(anchors, k - 1) if k > 1 else 1.0)
@@ -101,10 +102,11 @@ def _steadiest(steps: list[list[Judgement]], scale: list[float]) -> list[np.ndar
     return [candidates[number].T for candidates, number in zip(steps, reversed(chosen), strict=True)]
 
 
-def anchor_frames(stamp: np.ndarray) -> list[int]:
-    """List frames SPACING apart or just more, the first and the last among them."""
+def anchor_frames(stamp: np.ndarray, shows_depth: np.ndarray) -> list[int]:
+    """List frames SPACING apart or just more that show depth (F,), the first and the last of all among them."""
     anchors = [0]
     while anchors[-1] < len(stamp) - 1:
-        following = int(np.searchsorted(stamp, stamp[anchors[-1]] + SPACING - 1e-6))
-        anchors.append(min(max(following, anchors[-1] + 1), len(stamp) - 1))
+        following = max(int(np.searchsorted(stamp, stamp[anchors[-1]] + SPACING - 1e-6)), anchors[-1] + 1)
+        ahead = np.flatnonzero(shows_depth[following:])
+        anchors.append(min(following + int(ahead[0]) if len(ahead) else len(stamp) - 1, len(stamp) - 1))
     return anchors

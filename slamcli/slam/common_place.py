@@ -18,12 +18,12 @@ from slamcli.depth import icp
 from slamcli.depth.coarse_images import CoarseImages
 from slamcli.geometry import depth_noise, se3
 from slamcli.geometry.algebra import product
+from slamcli.slam import depth_views
 from slamcli.slam import moving_object_kernels as kernels
-from slamcli.slam import moving_objects
+from slamcli.slam.depth_views import Views
 from slamcli.slam.loop_candidates import Candidate
 from slamcli.slam.loop_verification import MAX_DISTANCE, RATIO, WIDENINGS, find_again
 from slamcli.slam.map_merging import Join
-from slamcli.slam.moving_objects import Views
 from slamcli.sparse_map import guided_matching, landmark_pose
 from slamcli.sparse_map.frame import FrameStore
 from slamcli.sparse_map.guided_matching import SearchLimits
@@ -135,7 +135,7 @@ class Jury:
                 order = np.argsort(between[row], kind="stable")[:VIEWS]
                 others = there[order[between[row, order] < OVERLAP]]
                 if len(others):
-                    z, seen = moving_objects.seen_from(views, int(frame[view]), frame[others])
+                    z, seen = depth_views.seen_from(views, int(frame[view]), frame[others])
                     again += float((z * z * (seen == kernels.AGAIN)).sum())
                     through += float((z * z * (seen == kernels.THROUGH)).sum())
         return again / (again + through) if again + through > 0.0 else 1.0
@@ -193,5 +193,5 @@ class Jury:
         u, v = np.rint(np.column_stack([x_c[:, 0] / z * small.fx + small.cx, x_c[:, 1] / z * small.fy + small.cy])).astype(np.int64).T
         is_in = (u >= 0) & (u < small.width) & (v >= 0) & (v < small.height)
         there = np.where(is_in, depth[v.clip(0, small.height - 1), u.clip(0, small.width - 1)], 0.0)
-        base, share, growth = moving_objects.TOLERANCE
+        base, share, growth = depth_views.TOLERANCE
         return (there > 0.0) & (np.abs(there - z) < base + share * z + growth * np.maximum(z - depth_noise.BEST, 0.0) ** 2)

@@ -4,7 +4,7 @@ import numpy as np
 
 from slamcli.geometry import se3
 from slamcli.geometry.algebra import product
-from slamcli.schema import KEY_FRAME, LOST, ON_DEPTH, TRACKED, Tracks
+from slamcli.schema import KEY_FRAME, LOST, ON_DEPTH, RELOCALIZED, TRACKED, Tracks
 from slamcli.sparse_map.sparse_map import SparseMap
 
 # [1/m^2, 1/rad^2] of a motion that goes on as before, or that the background shows: known within 10 mm and 0.6 degrees.
@@ -72,6 +72,15 @@ class FramePoses:
     def make_key_frame(self, i: int, kf: int) -> None:
         """Record that frame `i` is key frame `kf` itself."""
         self.ref_kf[i], self.T_kc[i], self.state[i], self.latest, self.anchored = kf, np.eye(4), KEY_FRAME, i, i
+
+    def before(self, i: int, seconds: float) -> int:
+        """Find the frame nearest to so many seconds before `i`, of those that were followed up to it without a gap, none recognized anew."""
+        p = i - 1
+        while self.state[p] != RELOCALIZED and self.stamp[i] - self.stamp[p] < seconds and self.has_pose(p - 1):
+            if self.segment(p - 1) != self.segment(p):
+                break
+            p -= 1
+        return p
 
     def predict(self, i: int, p: int, *, reach: float = STEADY_REACH) -> np.ndarray:
         """Predict T_cw of frame `i` by the background's motion, else as if that from the frame before `p` to frame `p` went on.

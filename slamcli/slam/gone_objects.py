@@ -4,9 +4,10 @@ from collections.abc import Callable, Iterable
 
 import numpy as np
 
+from slamcli.slam import depth_views
 from slamcli.slam import moving_object_kernels as kernels
-from slamcli.slam import moving_objects
-from slamcli.slam.moving_objects import FOR_MAPS, GROUP_JUMP, MOST, Views
+from slamcli.slam.depth_views import Views
+from slamcli.slam.moving_objects import FOR_MAPS, GROUP_JUMP, MOST
 
 AHEAD = 2.0  # [m] before a camera, what it looks at
 OVERLAP = 2.0  # [m] between what two views look at, that may show the same
@@ -18,7 +19,7 @@ def find(views: Views, recording: np.ndarray, key_frames: np.ndarray, progress: 
 
     recording : (F,) number of each frame's recording, in the order of time; key_frames : (K,) frames that may tell
     """
-    gone = np.zeros((len(recording), *moving_objects.shape(views.camera)), dtype=bool)
+    gone = np.zeros((len(recording), *depth_views.shape(views.camera)), dtype=bool)
     has_pose = np.isfinite(views.T_wc[:, 0, 0])
     key_frames = key_frames[has_pose[key_frames]]
     spot = views.T_wc[:, :3, 3] + AHEAD * views.T_wc[:, :3, 2]
@@ -33,7 +34,7 @@ def find(views: Views, recording: np.ndarray, key_frames: np.ndarray, progress: 
 
 
 def _find_in(views: Views, frame: int, others: np.ndarray) -> np.ndarray:
-    z, seen = moving_objects.seen_from(views, frame, others)
+    z, seen = depth_views.seen_from(views, frame, others)
     n_through, n_again = ((seen == said).sum(axis=0) for said in (kernels.THROUGH, kernels.AGAIN))
     found = kernels.groups((n_through >= FOR_MAPS.min_through) & (n_through > n_again), z, GROUP_JUMP, FOR_MAPS.min_group)
     area = z * z

@@ -88,7 +88,7 @@ class Localizer:
         """
         found = self._follow(i, frame)
         if found is not None and self.poses.has_background:
-            found = background_prior.reconcile(found, self.poses.predict(i, i - 1))
+            found = self._reconcile(i, found)
         if found is None or found.estimate.n_inliers < self._settings.depth_icp_below:
             by_depth = self._by_depth.locate(i, frame, found)
             if by_depth is not None:
@@ -115,6 +115,13 @@ class Localizer:
         else:
             start, seeds = estimate.T_cw, pairs.landmark[estimate.is_inlier]
         return self._local_map.match(frame, start, self._still_known(i, seeds), wanted=self._settings.min_inliers)
+
+    def _reconcile(self, i: int, found: MapMatch) -> MapMatch | None:
+        """Weigh the pose of frame `i` against the background's motion; None where it contradicts that."""
+        for p in (i - 1, self.poses.before(i, background_prior.LOOK_BACK)):
+            if background_prior.contradicts(found, self.poses.predict(i, p), self.poses.T_wc(p)):
+                return None
+        return background_prior.drawn(found, self.poses.predict(i, i - 1))
 
     def _still_known(self, i: int, ids: np.ndarray) -> np.ndarray:
         """List those of `ids` that still are landmarks; where none is, all of the reference key frame of the frame before `i`."""

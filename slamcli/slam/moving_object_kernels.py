@@ -61,8 +61,7 @@ def compare(
                 seen = other[place[r, c]] * unit
                 if seen == 0.0:
                     continue
-                far = max(depth, seen) - 0.4
-                allowed = tolerance[0] + tolerance[1] * depth + tolerance[2] * far * far
+                allowed = _allowed(depth, seen, tolerance)
                 if seen < depth - allowed:
                     out[k, v, u] = HIDDEN
                 elif seen <= depth + allowed:
@@ -79,6 +78,42 @@ def _is_farther(other, place, row, column, limit):
             if place[r, c] < 0 or other[place[r, c]] < limit:
                 return False
     return True
+
+
+@kernel
+def follow(
+    z: f4[:, ::1], z_r: f4[:, ::1], value_r: f8[:, ::1], step: i8, T: f8[:, ::1], pinhole: f8[::1], tolerance: f8[::1], value: f8[:, ::1]
+):  # fmt: skip
+    """Take the values of a reference view (v, u) over to the places of another that see the same surface in the same place.
+
+    z, z_r : (v, u) depth [m] at every `step`-th row and column of the coarse images, 0 = unknown
+    value_r, value : (v, u), NaN = none; one that is there already stays
+    T : (4, 4) from this camera to the reference; tolerance : as of `compare`
+    """
+    fx, fy, cx, cy = pinhole
+    rows, columns = z.shape
+    for v in range(rows):
+        for u in range(columns):
+            d = z[v, u]
+            if d == 0.0 or value[v, u] == value[v, u]:
+                continue
+            x, y = (u * step + step // 2 - cx) / fx * d, (v * step + step // 2 - cy) / fy * d
+            depth = T[2, 0] * x + T[2, 1] * y + T[2, 2] * d + T[2, 3]
+            if depth < Z_MIN:
+                continue
+            c = int(np.floor((fx * (T[0, 0] * x + T[0, 1] * y + T[0, 2] * d + T[0, 3]) / depth + cx + 0.5) / step))
+            r = int(np.floor((fy * (T[1, 0] * x + T[1, 1] * y + T[1, 2] * d + T[1, 3]) / depth + cy + 0.5) / step))
+            if r < 0 or c < 0 or r >= rows or c >= columns or z_r[r, c] == 0.0:
+                continue
+            if abs(z_r[r, c] - depth) <= _allowed(depth, z_r[r, c], tolerance):
+                value[v, u] = value_r[r, c]
+
+
+@kernel
+def _allowed(depth, seen, tolerance):
+    """Return by how much [m] two views may differ about the depth of one surface."""
+    far = max(depth, seen) - 0.4
+    return tolerance[0] + tolerance[1] * depth + tolerance[2] * far * far
 
 
 @kernel
@@ -115,6 +150,23 @@ def grow(seed: b1[:, ::1], is_open: b1[:, ::1], z: f4[:, ::1], jump: f8, most: i
     out = np.zeros((rows, columns), np.bool_)
     for k in range(n):
         out[stack[k] // columns, stack[k] % columns] = True
+    return out
+
+
+@kernel
+def fill(region: b1[:, ::1], z: f4[:, ::1], jump: f8, least: i8):
+    """Add the places (v, u) to a region of whose eight neighbours at least `least` belong to it and depth is continuous to them."""
+    rows, columns = region.shape
+    out = region.copy()
+    for row in range(rows):
+        for column in range(columns):
+            if region[row, column] or z[row, column] == 0.0:
+                continue
+            n = 0
+            for r in range(max(row - 1, 0), min(row + 2, rows)):
+                for c in range(max(column - 1, 0), min(column + 2, columns)):
+                    n += region[r, c] and abs(z[r, c] - z[row, column]) <= jump * z[row, column]
+            out[row, column] = n >= least
     return out
 
 

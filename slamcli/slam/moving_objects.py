@@ -16,39 +16,26 @@ import numpy as np
 
 from slamcli.depth import icp
 from slamcli.depth.coarse_images import CoarseImages
-from slamcli.geometry import se3
-from slamcli.geometry.algebra import product
 from slamcli.geometry.camera import Camera
 from slamcli.geometry.common_camera import Retelling
 from slamcli.schema import Features
 from slamcli.slam import moving_object_kernels as kernels
+from slamcli.slam import standing_objects
+from slamcli.slam.depth_views import STEP, Views, seen_from, shape
+from slamcli.slam.standing_objects import Evidence, Sightings, n_around
 
-STEP = 2  # coarse pixels from one place looked at to the next
 AFTER = (0.07, 0.14, 0.2, 0.35, 0.55, 0.8, 1.1)  # [s] before and after a view, of the views that it is compared with
+LATER, MUCH_LATER = (1.5, 2.0, 2.6, 3.3), (4.0, 5.0, 6.5, 8.0, 10.0, 13.0, 16.0)  # the same, for what waits, and for what is taken away
 LONG = 0.3  # [s] apart, from which on what is seen again in its place counts as still: a stride takes 0.5 s
 MIN_STILL = 2  # views long before or after that find a place again where it is still
-TOLERANCE = np.array([0.06, 0.02, 0.008])  # base [m], share of the depth, growth with its square [1/m]: poses err, readings too
-SMOOTH = 0.06  # of the depth, by which neighbours of a place that is compared differ at most: readings at edges hang in the air
 GROUP_JUMP, GROWTH_JUMP = 0.1, 0.05  # of the depth, between neighbouring places of one group and of one surface
-GROWTH_MOST = 12  # places from one surely moving: more, and what is seen once only would be taken along
-FOLLOWED = 0.8  # [s] before the end of the recording
-ENCLOSED = 4  # of its eight neighbours move: so does a place without depth
+GROWTH_MOST = 6  # places from one surely moving: more, and the floor around feet would be taken along
+OUTLINE, ENCLOSED = 3, 4  # of its eight neighbours move: so does a place without depth, beside the background and elsewhere
 MOST = 0.6  # of the surface seen [m^2]: when more seems to move, it is the pose that is wrong
 MAP_MARGIN = 2  # places around what moves that maps leave out: other views show what stands there
 QUICK_EVERY, QUICK_AFTER = 4, (0.35, 0.8)  # frames looked at first, and [s] as AFTER, to see whether anything moves at all
 QUICK_SHARE, QUICK_FRAMES = 0.02, 2  # a recording has moving objects when this share of a view moves in so many of these frames
 OUT_OF_SIGHT = -1e4  # [px] where no search looks
-
-
-@dataclass(frozen=True)
-class Views:
-    """The coarse depth images of a recording and where they were taken."""
-
-    depth: CoarseImages
-    stamp: np.ndarray  # (F,) [s]
-    T_wc: np.ndarray  # (F, 4, 4) camera to world, NaN = unknown
-    world: np.ndarray  # (F,) which world a pose is in: those of two cannot be compared
-    camera: Camera  # of the full images
 
 
 @dataclass(frozen=True)
@@ -59,34 +46,24 @@ class Rule:
     min_through: int  # views that look through a place
     weight_still: float  # such views a place needs for each one that finds it again
     min_group: int  # connected places: less is noise along edges
+    followed: float  # [s] before it goes, and after it came, over which what moves is recognized where it stands
 
 
+# Whether anything moves is asked of every recording, and poses that err are not to answer it.
+AT_ALL = Rule(QUICK_AFTER, min_through=1, weight_still=1.0, min_group=12, followed=0.0)
+# Poses that drift agree about views that are near in time only.
+UNDER_DRIFT = Rule(AFTER, min_through=1, weight_still=0.3, min_group=12, followed=1.0)
 # Poses may rest on what stands a while, but on nothing that moves. Maps show nothing that a later view looks through, and miss no view.
-FOR_POSES = Rule(AFTER, min_through=1, weight_still=1.0, min_group=12)
-FOR_MAPS = Rule((*AFTER, 2.0, 4.0, 8.0, 16.0), min_through=2, weight_still=0.15, min_group=4)
-
-
-@dataclass(frozen=True)
-class Evidence:
-    """What other views say of the places (v, u) of one view."""
-
-    depth: np.ndarray  # (v, u) float32 [m], 0 = unknown
-    n_through: np.ndarray  # (v, u) views that look through the place
-    n_still: np.ndarray  # (v, u) views at least LONG apart that find it again
-
-
-def shape(camera: Camera) -> tuple[int, int]:
-    """Return rows and columns of the camera's masks."""
-    rows, columns = icp.coarse_shape(camera)
-    return rows // STEP, columns // STEP
+FOR_POSES = Rule((*AFTER, *LATER), min_through=1, weight_still=1.0, min_group=12, followed=4.0)
+FOR_MAPS = Rule((*AFTER, *LATER, *MUCH_LATER), min_through=2, weight_still=0.15, min_group=4, followed=np.inf)
 
 
 def is_any(views: Views) -> bool:
     """Say whether anything moves in a recording, after a look at some of its frames."""
     found = 0
     for frame in range(0, len(views.stamp), QUICK_EVERY):
-        evidence = weigh(views, frame, QUICK_AFTER)
-        if evidence is not None and _surely_moving(evidence, FOR_POSES).mean() > QUICK_SHARE:
+        evidence = weigh(views, frame, AT_ALL.after)
+        if evidence is not None and _surely_moving(evidence, AT_ALL).mean() > QUICK_SHARE:
             found += 1
     return found >= QUICK_FRAMES
 
@@ -94,46 +71,40 @@ def is_any(views: Views) -> bool:
 def find(views: Views, progress: Callable[[range], Iterable[int]] = iter, *, rule: Rule = FOR_POSES) -> np.ndarray:
     """Find what moves in every view, (F, v, u) bool; nothing where its pose is unknown or contradicts most of what is seen.
 
-    The last views have none after them that would look through what moves: there it is followed from the view before.
+    What moves in one view is followed to the views before and after it, to where it stands.
     """
-    moving = np.zeros((len(views.stamp), *shape(views.camera)), dtype=bool)
-    for frame in progress(range(len(moving))):
-        is_followed = frame > 0 and views.stamp[-1] - views.stamp[frame] < FOLLOWED
-        moving[frame] = _find_in(views, frame, moving[frame - 1] if is_followed else None, rule)
+    sightings = Sightings.none(len(views.stamp), shape(views.camera))
+    for frame in progress(range(len(views.stamp))):
+        evidence = weigh(views, frame, rule.after)
+        if evidence is not None:
+            sightings.note(frame, evidence, *_find_in(evidence, rule))
+    moving = standing_objects.follow(views, sightings, most=rule.followed)
+    for frame, found in enumerate(moving):
+        z = sightings.z(frame)
+        if _is_most(found, z):
+            found[:] = sightings.is_moving[frame]
+        found |= _outline(found, z)
     return moving
 
 
-def _find_in(views: Views, frame: int, before: np.ndarray | None, rule: Rule) -> np.ndarray:
-    """Find what moves in one view, (v, u) bool; before : (v, u) what moves in the view before, if that is to be followed."""
-    evidence = weigh(views, frame, rule.after)
-    if evidence is None:
-        return np.zeros(shape(views.camera), dtype=bool)
+def _find_in(evidence: Evidence, rule: Rule) -> tuple[np.ndarray, np.ndarray]:
+    """Find what surely moves in one view, (v, u) bool, by what other views say of it, and all that moves with it."""
     z, seed = evidence.depth, _surely_moving(evidence, rule)
     is_still = (evidence.n_still >= MIN_STILL) & (evidence.n_through == 0)
-    followed = np.zeros_like(seed) if before is None else _followed(views, frame, z, before) & ~is_still
-    if not (seed | followed).any():
-        return seed
-    is_open = ~is_still & (z > 0)
-    moving = kernels.grow(seed, is_open, z, GROWTH_JUMP, GROWTH_MOST) | kernels.grow(followed, is_open, z, GROWTH_JUMP, 1)
+    moving = kernels.grow(seed, ~is_still & (z > 0), z, GROWTH_JUMP, GROWTH_MOST) if seed.any() else seed
+    return (np.zeros_like(seed), np.zeros_like(seed)) if _is_most(moving, z) else (seed, moving)
+
+
+def _is_most(moving: np.ndarray, z: np.ndarray) -> bool:
+    """Say whether more of the surface seen moves than can be believed."""
     area = z * z
-    if area[moving].sum() > MOST * area.sum():
-        return np.zeros_like(seed)
-    around = cv2.boxFilter(moving.astype(np.float32), -1, (3, 3), normalize=False, borderType=cv2.BORDER_REPLICATE)
-    return moving | ((around >= ENCLOSED) & (z == 0))  # outlines have no depth
+    return bool(area[moving].sum() > MOST * area.sum())
 
 
-def _followed(views: Views, frame: int, z: np.ndarray, before: np.ndarray) -> np.ndarray:
-    """Find the places (v, u) of a view that lie where something moved in the view before."""
-    small, _ = icp.coarse_camera(views.camera)
-    v, u = (STEP * index + STEP // 2 for index in np.indices(z.shape))
-    x = small.backproject(np.stack([u, v], axis=-1).reshape(-1, 2).astype(np.float64), z.ravel())
-    x = se3.transform(product(se3.inverse(views.T_wc[frame - 1]), views.T_wc[frame]), x)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        column, row = (np.stack([small.fx * x[:, 0], small.fy * x[:, 1]]) / x[:, 2] + [[small.cx], [small.cy]] + 0.5) // STEP
-    inside = (x[:, 2] > 0) & (z.ravel() > 0) & (row >= 0) & (column >= 0) & (row < z.shape[0]) & (column < z.shape[1])
-    out = np.zeros(z.size, dtype=bool)
-    out[inside] = before[row[inside].astype(np.int64), column[inside].astype(np.int64)]
-    return out.reshape(z.shape)
+def _outline(moving: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """Find the places (v, u) without depth that belong to what moves: between it and the background; its shadow in the pattern is wider."""
+    n_moving, n_still = (n_around(places) for places in (moving, ~moving & (z > 0)))
+    return (z == 0) & (n_moving >= np.where(n_still > 0, OUTLINE, ENCLOSED))
 
 
 def weigh(views: Views, frame: int, after: tuple[float, ...]) -> Evidence | None:
@@ -142,23 +113,15 @@ def weigh(views: Views, frame: int, after: tuple[float, ...]) -> Evidence | None
     if len(others) == 0 or not np.isfinite(views.T_wc[frame, 0, 0]):
         return None
     middle, seen = seen_from(views, frame, others)
-    is_long = np.abs(views.stamp[others] - views.stamp[frame]) >= LONG
-    return Evidence(middle, (seen == kernels.THROUGH).sum(axis=0), (seen[is_long] == kernels.AGAIN).sum(axis=0))
-
-
-def seen_from(views: Views, frame: int, others: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Look from other views (N,) at what one shows: depth (v, u) [m], 0 = unknown, and what each says of it, (N, v, u), as the kernel `compare` has it."""
-    small, row_at = icp.coarse_camera(views.camera)
-    place = np.where(row_at < small.width * small.height, row_at, -1).astype(np.int32)
-    raw = np.append(views.depth[frame].ravel(), np.uint16(0))
-    z = raw[place].astype(np.float32) * np.float32(icp.UNIT)  # -1 takes the 0 at the end
-    T = np.ascontiguousarray(product(se3.inverse(views.T_wc[others]), views.T_wc[frame]))
-    pinhole = np.array([small.fx, small.fy, small.cx, small.cy])
-    seen = np.zeros((len(others), *shape(views.camera)), dtype=np.uint8)
-    images = views.depth.of(others)
-    kernels.compare(z, kernels.smooth_places(z, SMOOTH), STEP, images, place, T, pinhole, TOLERANCE, icp.UNIT, seen)
-    rows, columns = seen.shape[1:]
-    return np.ascontiguousarray(z[STEP // 2 :: STEP, STEP // 2 :: STEP][:rows, :columns]), seen
+    apart, is_again = views.stamp[others] - views.stamp[frame], seen == kernels.AGAIN
+    when = np.where(is_again, apart.astype(np.float32)[:, None, None], np.float32(0.0))
+    return Evidence(
+        depth=middle,
+        n_through=(seen == kernels.THROUGH).sum(axis=0),
+        n_still=is_again[np.abs(apart) >= LONG].sum(axis=0),
+        since=when.min(axis=0, initial=0.0),
+        until=when.max(axis=0, initial=0.0),
+    )
 
 
 def _others(views: Views, frame: int, after: tuple[float, ...]) -> np.ndarray:

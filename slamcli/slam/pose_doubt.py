@@ -14,11 +14,11 @@ from scipy import sparse
 from scipy.sparse import csgraph
 
 from slamcli.geometry import se3
-from slamcli.geometry.algebra import product
+from slamcli.geometry.algebra import inverse, product
 from slamcli.schema import ON_DEPTH, Doubt, Map, Tracks, poses_in_segments
 from slamcli.slam import doubt, moving_objects
+from slamcli.slam.depth_views import Views
 from slamcli.slam.doubt import Finding
-from slamcli.slam.moving_objects import Views
 
 EVERY = 4  # frames from one whose view is compared with others to the next
 SPAN = 0.5  # [s] of the motion that tracking and the final pass are compared over
@@ -67,16 +67,17 @@ def _drift(tracks: Tracks, map_: Map, is_blind: np.ndarray) -> np.ndarray:
     """Estimate the standard deviation (F,) [m] of each frame's position beside the longest stretch of frames that landmarks hold well.
 
     is_blind : (F,) frames that show no static world, or contradict it
-    Variances add up along the shortest way there: from frame to frame, and from key frame to key frame that see the same.
+    Variances add up along the shortest way there: from frame to frame, from key frame to key frame that see the same, and along edges of the
+    map, unless they lead past frames that are blind: what is aligned there may be somebody who fills the view.
     """
     n = len(is_blind)
     step = np.clip(STEP_LANDMARK_SIGMA / np.maximum(tracks.n_inliers, 1), STEP_BEST, STEP_WORST)
     step[is_blind] = STEP_BLIND
     frames = np.arange(n - 1)
     variance = np.maximum(step[1:], step[:-1]) ** 2
-    ties = _ties(map_)
-    row, column = np.concatenate([frames, ties[:, 0]]), np.concatenate([frames + 1, ties[:, 1]])
-    value = np.concatenate([variance, np.full(len(ties), TIE_SIGMA**2)])
+    ties, (edges, edge_variance) = _ties(map_), _edges(map_, is_blind)
+    row, column = np.concatenate([frames, ties[:, 0], edges[:, 0]]), np.concatenate([frames + 1, ties[:, 1], edges[:, 1]])
+    value = np.concatenate([variance, np.full(len(ties), TIE_SIGMA**2), edge_variance])
     order = np.argsort(-value, kind="stable")  # of several ways between two frames, the last one written is the best
     graph = sparse.lil_matrix((n, n))
     graph[row[order], column[order]] = value[order]
@@ -94,6 +95,15 @@ def _ties(map_: Map) -> np.ndarray:
     ends = np.append(starts[1:], len(map_.obs_lm)) - 1
     pairs, n_shared = np.unique(np.stack([map_.obs_kf[starts], map_.obs_kf[ends]], axis=1), axis=0, return_counts=True)
     return map_.kf_frame[pairs[(n_shared >= TIED) & (pairs[:, 0] != pairs[:, 1])]].astype(np.int64)
+
+
+def _edges(map_: Map, is_blind: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """List pairs (N, 2) of frames, both key frames, that edges of the map join, with the variance (N,) [m^2] of their relative position."""
+    frames = np.sort(map_.kf_frame[map_.edge_kf].astype(np.int64).reshape(-1, 2), axis=1)
+    n_blind = np.concatenate([[0], np.cumsum(is_blind)])
+    sees = n_blind[frames[:, 1] + 1] == n_blind[frames[:, 0]]
+    covariance = inverse(map_.edge_information[sees])
+    return frames[sees], covariance[:, 0, 0] + covariance[:, 1, 1] + covariance[:, 2, 2]
 
 
 def findings(record: Doubt) -> list[Finding]:

@@ -113,7 +113,7 @@ class Tracker:
         # Landmarks enough to recognize a place by hold the key frame; depth alone might slide along a corridor.
         if self._poses.state[i] == ON_DEPTH and len(known) < self._settings.relocalize_inliers:
             self._localizer.aligner.join(kf)
-        if self._background is not None:
+        if self._background is not None and len(known) < background_prior.ENOUGH:
             self._join_by_background(kf, self._background)
         self._poses.make_key_frame(i, kf)
         self._growth.cull_share_adjust(kf, added, known)

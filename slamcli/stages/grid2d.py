@@ -21,8 +21,9 @@ from slamcli.navigation.terrain import Terrain
 from slamcli.schema import FrameTimes, Grid, Ground, Map, Tracks, frame_poses
 from slamcli.stages.contract import Inputs, Summary, Tools
 from slamcli.stages.depth_frames import DepthFrames, PosedFrame, depth_poses
-from slamcli.stages.moving_parts import coarse_images
+from slamcli.stages.moving_parts import MOVES, coarse_images
 
+MOVED_ON = 0.2  # [s] after which what moves lets see another part of the floor: a quarter of a metre at a walk
 BODY_VIEWS = 60  # spread over the drive, in which the robot's own body is looked for
 
 
@@ -55,9 +56,13 @@ def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
 def _from_depth(inputs: Inputs, T_lw: np.ndarray, cfg: Config, tools: Tools) -> tuple[Grid, int]:
     option, depths = cfg.grid2d, DepthFrames.of(inputs, tools)
     rays = np.ascontiguousarray(depths.camera.rays)
-    has_depth = np.isfinite(inputs.load(FrameTimes, "loop").depth_stamp)
+    depth_stamp, moving = inputs.load(FrameTimes, "loop").depth_stamp, depths.moving.moving
+    has_depth = np.isfinite(depth_stamp)
     poses = [(frame, product(T_lw, T_wd)) for frame, T_wd in depth_poses(inputs, frames="all") if has_depth[frame]]
     chosen = grid.spaced(np.array([T_ld for _, T_ld in poses]).reshape(-1, 4, 4), metres=option.spacing, degrees=option.spacing_deg)
+    if len(moving):
+        frames = np.array([frame for frame, _ in poses], dtype=np.int64)
+        chosen = np.union1d(chosen, _past_what_moves(depth_stamp[frames], moving[frames].mean(axis=(1, 2))))
 
     is_left_out = _left_out(inputs, [poses[row] for row in chosen.tolist()], cfg, tools)
 
@@ -79,6 +84,19 @@ def _from_depth(inputs: Inputs, T_lw: np.ndarray, cfg: Config, tools: Tools) -> 
             yield view
 
     return grid.fuse_over_floor(views, settings=option), n_views
+
+
+def _past_what_moves(stamp: np.ndarray, share: np.ndarray) -> np.ndarray:
+    """List rows of frames some time apart in which something moves: what it hides in one, another shows, also while the camera rests.
+
+    stamp : (N,) [s]; share : (N,) of the view that moves
+    """
+    chosen, last = list[int](), -np.inf
+    for row in np.flatnonzero(share > MOVES).tolist():
+        if stamp[row] - last >= MOVED_ON:
+            chosen.append(row)
+            last = stamp[row]
+    return np.array(chosen, dtype=np.int64)
 
 
 def _left_out(inputs: Inputs, poses: list[PosedFrame], cfg: Config, tools: Tools) -> np.ndarray | None:

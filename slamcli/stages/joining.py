@@ -40,7 +40,7 @@ from slamcli.schema import (
     Tracks,
     Words,
 )
-from slamcli.slam import doubt, map_segments, moving_objects
+from slamcli.slam import depth_views, doubt, map_segments, moving_objects
 from slamcli.slam.doubt import Finding
 from slamcli.stages.association_file import write_association
 from slamcli.stages.camera_file import write_camera
@@ -275,7 +275,7 @@ def _moving(parts: Sequence[Part], camera: Camera) -> Moving:
     told = [
         moving_objects.retold(one, part.camera, camera)
         if len(one)
-        else np.zeros((part.summary["frames"], *moving_objects.shape(camera)), dtype=bool)
+        else np.zeros((part.summary["frames"], *depth_views.shape(camera)), dtype=bool)
         for part, one in zip(parts, found, strict=True)
     ]
     return Moving(np.concatenate(told))

@@ -6,7 +6,8 @@ from slamcli.depth.coarse_images import CoarseImages
 from slamcli.geometry.camera import Camera
 from slamcli.schema import CoarseDepth, Features, Map, Moving, Tracks, poses_in_segments
 from slamcli.slam import gone_objects, moving_objects
-from slamcli.slam.moving_objects import FOR_POSES, Rule, Views
+from slamcli.slam.depth_views import Views
+from slamcli.slam.moving_objects import FOR_POSES, Rule
 from slamcli.stages.contract import Inputs, Stored, Summary, Tools
 
 NOTHING = Moving()

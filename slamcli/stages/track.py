@@ -21,6 +21,8 @@ from slamcli.schema import (
 from slamcli.slam import map_segments, moving_objects, rests
 from slamcli.slam.background_motion import BackgroundMotion
 from slamcli.slam.depth_tracking import FramePoints
+from slamcli.slam.depth_views import Views
+from slamcli.slam.moving_objects import UNDER_DRIFT
 from slamcli.slam.recording import KnownMotion, Recording
 from slamcli.slam.tracker import Tracker
 from slamcli.sparse_map.frame import FrameStore
@@ -74,8 +76,8 @@ def _find_background(inputs: Inputs, cfg: Config, tools: Tools) -> tuple[Moving,
         features, still = moving_parts.still(inputs, moving)
         motion = BackgroundMotion(features, words, still, camera, cfg.sensor, tools.rng())
         T_wc = motion.poses(lambda anchors: tools.progress(anchors, "background"), before=T_wc if number else None)
-        views = moving_objects.Views(depth, np.asarray(features.stamp), T_wc, np.zeros(len(T_wc), dtype=np.int64), camera)
-        moving = Moving(moving_objects.find(views, lambda frames: tools.progress(frames, "moving objects")))
+        views = Views(depth, np.asarray(features.stamp), T_wc, np.zeros(len(T_wc), dtype=np.int64), camera)
+        moving = Moving(moving_objects.find(views, lambda frames: tools.progress(frames, "moving objects"), rule=UNDER_DRIFT))
     return moving, T_wc
 
 

@@ -14,12 +14,13 @@ from slamcli.config.options import SensorConfig
 from slamcli.depth import icp
 from slamcli.geometry import se3
 from slamcli.schema import Features, Words
-from slamcli.slam import background_motion_kernels, moving_object_kernels, moving_objects
+from slamcli.slam import background_motion_kernels, depth_views, moving_object_kernels, moving_objects
 from slamcli.slam.background_motion import SWERVE_COST, SWERVE_MOST, BackgroundMotion, _steadiest, anchor_frames
 from slamcli.slam.background_step import FLATNESS, SWERVE_M, Judgement
-from slamcli.slam.moving_objects import STEP, Views
+from slamcli.slam.depth_views import STEP, Views
 
 FRAMES, RATE, SPEED = 36, 15.0, 0.6
+WAIT, RESTING = 18, ("leaving", "waiting")  # frames that the waiter stands for; recordings of a camera at rest
 WIDTH, NEAR, TALL = 0.55, 1.2, 1.3  # [m] of the walker, before the camera, and its height
 
 
@@ -33,17 +34,26 @@ def walker(i: int) -> tuple:
     return (x, y - WIDTH / 2, 0.0), (x + 0.3, y + WIDTH / 2, TALL)
 
 
+def waiter(i: int) -> tuple:
+    """The same box, that stands and then goes aside at a walk, out of the view of a camera at rest."""
+    (x, y, z), (x1, y1, z1) = walker(14)
+    aside = 0.1 * max(0, i - WAIT)
+    return (x, y + aside, z), (x1, y1 + aside, z1)
+
+
 @cache
 def recording(who: str) -> tuple[Views, np.ndarray]:
     """Views of the room with nobody, somebody who walks, or somebody who stands in it; and the places (F, v, u) that show somebody."""
     depth, masks = [], []
     for i in range(FRAMES):
-        boxes = {"nobody": (), "walking": (walker(i),), "standing": (walker(12),), "leaving": (walker(14),) if i < 18 else ()}[who]
-        T_lc = camera_at(0 if who == "leaving" else i)
+        boxes = {
+            "nobody": (), "walking": (walker(i),), "standing": (walker(12),), "leaving": (walker(14),) if i < 18 else (), "waiting": (waiter(i),),
+        }[who]  # fmt: skip
+        T_lc = camera_at(0 if who in RESTING else i)
         seen, empty = render(T_lc, KINECT, boxes=(*FURNITURE, *boxes)), render(T_lc, KINECT)
         depth.append(icp.coarsen(seen))
         masks.append((seen < empty - 1e-3)[STEP // 2 :: STEP, STEP // 2 :: STEP])
-    T_wc = np.array([camera_at(0 if who == "leaving" else i) for i in range(FRAMES)])
+    T_wc = np.array([camera_at(0 if who in RESTING else i) for i in range(FRAMES)])
     return Views(coded(depth), np.arange(FRAMES) / RATE, T_wc, np.zeros(FRAMES, dtype=np.int64), KINECT), np.array(masks)
 
 
@@ -73,6 +83,16 @@ def test_who_stood_half_the_time_is_kept_for_poses_and_not_for_maps() -> None:
         assert (found & ~truth).sum() / (~truth).sum() < 0.03
 
 
+def test_who_waits_and_then_walks_on_is_found_while_waiting_and_the_floor_is_not() -> None:
+    views, truth = recording("waiting")
+    found = moving_objects.find(views)
+    recall = np.array([(a & b).sum() / b.sum() for a, b in zip(found[: WAIT + 4], truth[: WAIT + 4], strict=True)])
+    assert recall.min() > 0.75 and np.median(recall) > 0.9
+    assert (found & ~truth).sum() / (~truth).sum() < 0.02
+    kept = moving_objects.find(views, rule=replace(moving_objects.FOR_POSES, followed=0.0))
+    assert (kept & truth)[2 : WAIT - 6].sum() < 0.5 * (found & truth)[2 : WAIT - 6].sum()  # that is what following adds
+
+
 def test_nothing_is_said_under_unknown_or_wholly_wrong_poses() -> None:
     views, _ = recording("walking")
     lost = replace(views, T_wc=np.full_like(views.T_wc, np.nan))
@@ -87,7 +107,7 @@ def test_nothing_is_said_under_unknown_or_wholly_wrong_poses() -> None:
 
 def test_hiding_takes_away_what_is_marked_and_no_more() -> None:
     views, _ = recording("walking")
-    rows, columns = moving_objects.shape(KINECT)
+    rows, columns = depth_views.shape(KINECT)
     moving = np.zeros((FRAMES, rows, columns), dtype=bool)
     moving[3, 20:30, 30:40] = True
     xy = np.array([[70.0, 50.0], [10.0, 10.0], [70.0, 50.0]], dtype=np.float32)  # the first is in the middle of what moves
@@ -210,10 +230,17 @@ def test_what_another_view_says_of_a_wall(seen: float, said: str) -> None:
 
 def test_anchors_are_apart_and_hold_both_ends() -> None:
     stamp = np.cumsum(np.random.default_rng(0).uniform(0.01, 0.2, 80))
-    anchors = np.array(anchor_frames(stamp))
+    anchors = np.array(anchor_frames(stamp, np.ones(80, bool)))
     assert anchors[0] == 0 and anchors[-1] == 79 and (np.diff(anchors) > 0).all()
     assert (np.diff(stamp[anchors])[:-1] >= 0.35 - 1e-6).all() and np.diff(stamp[anchors]).max() < 0.35 + 0.2
-    assert anchor_frames(stamp[:1]) == [0]
+    assert anchor_frames(stamp[:1], np.ones(1, bool)) == [0]
+
+
+def test_anchors_show_depth_but_for_the_ends() -> None:
+    shows = np.random.default_rng(3).random(200) < 0.5
+    shows[190:] = False
+    anchors = anchor_frames(np.arange(200) / 30.0, shows)
+    assert shows[anchors[1:-1]].all() and (anchors[0], anchors[-1]) == (0, 199) and np.diff(anchors).max() < 20
 
 
 def judged(scores: list[float], forward: list[float]) -> list[Judgement]:

@@ -11,8 +11,8 @@ from kinect import coded
 from slamcli.depth import icp
 from slamcli.geometry import se3
 from slamcli.schema import TRACKED, Doubt, Map, Tracks
-from slamcli.slam import moving_objects, pose_doubt
-from slamcli.slam.moving_objects import Views
+from slamcli.slam import depth_views, pose_doubt
+from slamcli.slam.depth_views import Views
 
 FRAMES, RATE = 40, 15.0
 NOTHING = np.zeros((0, 0, 0), dtype=bool)
@@ -26,8 +26,10 @@ def room() -> tuple[Views, np.ndarray]:
     return Views(depth, np.arange(FRAMES) / RATE, T_wc, np.zeros(FRAMES, dtype=np.int64), KINECT), T_wc
 
 
-def found(T_wc: np.ndarray, n_inliers: np.ndarray | int = 200, ties: tuple[tuple[int, int], ...] = ()) -> tuple[Tracks, Map]:
-    """Tracks of these poses, each frame a key frame; `ties` : pairs of frames that see the same 50 landmarks."""
+def found(
+    T_wc: np.ndarray, n_inliers: np.ndarray | int = 200, ties: tuple[tuple[int, int], ...] = (), edges: tuple[tuple[int, int], ...] = ()
+) -> tuple[Tracks, Map]:
+    """Tracks of these poses, each frame a key frame; `ties` : pairs of frames that see the same 50 landmarks; `edges` : that are 3 mm sure."""
     n = len(T_wc)
     tracks = Tracks(
         ref_kf=np.arange(n, dtype=np.int32), T_kc=np.tile(np.eye(4), (n, 1, 1)), state=np.full(n, TRACKED, np.uint8),
@@ -36,7 +38,11 @@ def found(T_wc: np.ndarray, n_inliers: np.ndarray | int = 200, ties: tuple[tuple
     obs_kf = np.array([frame for pair in ties for _ in range(50) for frame in pair], np.int32)
     obs_lm = np.repeat(np.arange(len(obs_kf) // 2, dtype=np.int32), 2)
     frames = np.arange(n, dtype=np.int32)
-    map_ = Map(frames, np.zeros(n, np.int32), T_wc, np.zeros((len(obs_kf) // 2, 3)), obs_lm, obs_kf, np.zeros(len(obs_kf), np.int64))
+    edge_kf = np.array(edges, dtype=np.int32).reshape(-1, 2)
+    map_ = Map(
+        frames, np.zeros(n, np.int32), T_wc, np.zeros((len(obs_kf) // 2, 3)), obs_lm, obs_kf, np.zeros(len(obs_kf), np.int64),
+        edge_kf, np.tile(np.eye(4), (len(edges), 1, 1)), np.tile(3.0 / 0.003**2 * np.eye(6), (len(edges), 1, 1)),
+    )  # fmt: skip
     return tracks, map_
 
 
@@ -79,7 +85,7 @@ def test_frames_that_few_landmarks_hold_are_doubtful_and_the_lost_have_no_sigma(
 
 def covered(frames: range) -> np.ndarray:
     """Masks in which most of the view moves in these frames."""
-    moving = np.zeros((FRAMES, *moving_objects.shape(KINECT)), dtype=bool)
+    moving = np.zeros((FRAMES, *depth_views.shape(KINECT)), dtype=bool)
     moving[frames.start : frames.stop, :, :-8] = True
     return moving
 
@@ -98,12 +104,24 @@ def test_landmarks_seen_before_and_after_tie_both_sides_together() -> None:
 
 def test_few_landmarks_drift_only_where_things_move() -> None:
     weak = np.where(np.arange(FRAMES) >= 25, 16, 200)
-    moving = np.zeros((FRAMES, *moving_objects.shape(KINECT)), dtype=bool)
+    moving = np.zeros((FRAMES, *depth_views.shape(KINECT)), dtype=bool)
     moving[:, :3, :3] = True
     drift = judged(room()[1], n_inliers=weak, moving=moving).drift
     assert (
         drift.max() == pytest.approx(np.sqrt(15) * pose_doubt.STEP_WORST, rel=0.1) and (judged(room()[1], n_inliers=weak).drift == 0).all()
     )
+
+
+def test_edges_hold_what_few_landmarks_hold_but_not_past_frames_that_see_no_static_world() -> None:
+    weak = np.where(np.arange(FRAMES) >= 25, 16, 200)
+    moving = np.zeros((FRAMES, *depth_views.shape(KINECT)), dtype=bool)
+    moving[:, :3, :3] = True
+    chain = ((31, 24), (31, 38))
+    held = judged(room()[1], n_inliers=weak, moving=moving, edges=chain).drift
+    assert held[38] ** 2 - held[24] ** 2 == pytest.approx(2 * 0.003**2, rel=0.01) and held.max() < 4 * pose_doubt.STEP_WORST
+    moving[28, :, :-8] = True
+    past = judged(room()[1], n_inliers=weak, moving=moving, edges=chain).drift
+    assert past[38] > pose_doubt.STEP_BLIND
 
 
 @pytest.mark.parametrize(("n_doubtful", "n_lost", "is_grave"), [(7, 0, False), (8, 0, True), (7, 5, True), (7, 4, False)])

@@ -9,7 +9,7 @@ from boxroom import KINECT
 
 from slamcli.report import pictures
 from slamcli.schema import Moving
-from slamcli.slam import moving_objects
+from slamcli.slam import depth_views
 from slamcli.visualization import moving_tint
 
 SHAPE = KINECT.height, KINECT.width
@@ -17,7 +17,7 @@ SHAPE = KINECT.height, KINECT.width
 
 def masks() -> Moving:
     """Three frames: nothing moves in the first, a block in the second, a larger one in the third."""
-    moving = np.zeros((3, *moving_objects.shape(KINECT)), dtype=bool)
+    moving = np.zeros((3, *depth_views.shape(KINECT)), dtype=bool)
     moving[1, 4:6, 4:8] = moving[2, 2:12, 2:20] = True
     return Moving(moving)
 
@@ -26,7 +26,7 @@ def test_the_places_of_the_mask_are_tinted_and_the_rest_is_as_it_was() -> None:
     rgb = np.full((*SHAPE, 3), 100, np.uint8)
     assert moving_tint.tinted(rgb, Moving(), 1, KINECT) is rgb and moving_tint.tinted(rgb, masks(), 0, KINECT) is rgb
     changed = (moving_tint.tinted(rgb, masks(), 1, KINECT) != rgb).any(axis=2)
-    side = SHAPE[1] // moving_objects.shape(KINECT)[1]
+    side = SHAPE[1] // depth_views.shape(KINECT)[1]
     expected = np.zeros(SHAPE, dtype=bool)
     expected[4 * side : 6 * side, 4 * side : 8 * side] = True
     np.testing.assert_array_equal(changed, expected)
