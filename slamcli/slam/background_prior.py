@@ -29,7 +29,7 @@ def contradicts(found: MapMatch, expected: np.ndarray, T_wp: np.ndarray) -> bool
     """
     if found.estimate.n_inliers >= MANY:
         return False
-    motion, apart = np.abs(se3.log(product(expected, T_wp))), _apart(expected, found.estimate.T_cw)
+    motion, apart = se3.log(product(expected, T_wp)), _apart(expected, found.estimate.T_cw)
     least = np.repeat([APART_M, APART_RAD], 3)
     share = np.repeat([APART_SHARE * np.sqrt((part * part).sum()) for part in (motion[:3], motion[3:])], 3)
     covariance = inverse(found.estimate.information)

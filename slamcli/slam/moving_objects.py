@@ -22,14 +22,13 @@ from slamcli.schema import Features
 from slamcli.slam import moving_object_kernels as kernels
 from slamcli.slam import standing_objects
 from slamcli.slam.depth_views import STEP, Views, seen_from, shape
-from slamcli.slam.standing_objects import Evidence, Sightings, n_around
+from slamcli.slam.standing_objects import GROWTH_MOST, JUMP, Evidence, Sightings, n_around
 
 AFTER = (0.07, 0.14, 0.2, 0.35, 0.55, 0.8, 1.1)  # [s] before and after a view, of the views that it is compared with
 LATER, MUCH_LATER = (1.5, 2.0, 2.6, 3.3), (4.0, 5.0, 6.5, 8.0, 10.0, 13.0, 16.0)  # the same, for what waits, and for what is taken away
 LONG = 0.3  # [s] apart, from which on what is seen again in its place counts as still: a stride takes 0.5 s
 MIN_STILL = 2  # views long before or after that find a place again where it is still
-GROUP_JUMP, GROWTH_JUMP = 0.1, 0.05  # of the depth, between neighbouring places of one group and of one surface
-GROWTH_MOST = 6  # places from one surely moving: more, and the floor around feet would be taken along
+GROUP_JUMP = 0.1  # of the depth, between neighbouring places of one group
 OUTLINE, ENCLOSED = 3, 4  # of its eight neighbours move: so does a place without depth, beside the background and elsewhere
 MOST = 0.6  # of the surface seen [m^2]: when more seems to move, it is the pose that is wrong
 MAP_MARGIN = 2  # places around what moves that maps leave out: other views show what stands there
@@ -91,7 +90,7 @@ def _find_in(evidence: Evidence, rule: Rule) -> tuple[np.ndarray, np.ndarray]:
     """Find what surely moves in one view, (v, u) bool, by what other views say of it, and all that moves with it."""
     z, seed = evidence.depth, _surely_moving(evidence, rule)
     is_still = (evidence.n_still >= MIN_STILL) & (evidence.n_through == 0)
-    moving = kernels.grow(seed, ~is_still & (z > 0), z, GROWTH_JUMP, GROWTH_MOST) if seed.any() else seed
+    moving = kernels.grow(seed, ~is_still & (z > 0), z, JUMP, GROWTH_MOST) if seed.any() else seed
     return (np.zeros_like(seed), np.zeros_like(seed)) if _is_most(moving, z) else (seed, moving)
 
 

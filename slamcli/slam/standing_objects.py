@@ -15,7 +15,9 @@ from slamcli.slam import moving_object_kernels as kernels
 from slamcli.slam.depth_views import Views
 
 GONE = 0.35  # [s] after what moves is last seen in its place, from which on nothing of it may be found there again
-ALIKE = 6  # places around, that what moves goes from at about the same time; as far as it is taken along, moving_objects.GROWTH_MOST
+GROWTH_MOST = (
+    6  # places from one surely moving that move along, and that it goes from at about the same time: more, and floor is taken along
+)
 JUMP = 0.05  # of the depth, between neighbouring places of one surface
 THICK, LEAST = 4, 30  # of nine places, and connected places, that are followed: fewer are edges of what stands beside
 FILLED = 5  # of its eight neighbours move, on one surface with it: so does a place
@@ -97,7 +99,7 @@ def _left_at(views: Views, sightings: Sightings, frames: tuple[int, int], left_b
 
 def _latest_around(when: np.ndarray, is_sure: np.ndarray) -> np.ndarray:
     """Return the latest time [s] near each place (v, u) at which what surely moves is seen in its place."""
-    side = 2 * ALIKE + 1
+    side = 2 * GROWTH_MOST + 1
     return cv2.dilate(np.where(is_sure, when, -np.inf), np.ones((side, side), np.uint8))
 
 
