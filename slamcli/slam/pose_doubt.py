@@ -29,6 +29,7 @@ CONTRADICTED = 0.03  # share of the surface; right poses leave 0.01 on real reco
 DISAGREEMENT = 0.03  # [m]
 DOUBTFUL_SIGMA = 0.03  # [m]
 MOVING = 0.6  # share of a view
+SHOWN = 100  # landmarks that hold a pose, from which on a view that mostly moves still shows the static world beside it
 # [m] by which the motion from one frame to the next errs over the number of landmarks, at best, where few hold it, where no static world shows
 STEP_LANDMARK_SIGMA, STEP_BEST, STEP_WORST, STEP_BLIND = 0.2, 0.001, 0.005, 0.02
 TIED = 30  # landmarks that two key frames share, so that nothing that happened between them tears them apart
@@ -50,7 +51,7 @@ def judge(views: Views, moving: np.ndarray, first: tuple[Tracks, Map], final: tu
     sigma = np.sqrt(BASE_SIGMA**2 + support**2 + np.nan_to_num(disagreement) ** 2)
     is_doubtful = (sigma > DOUBTFUL_SIGMA) | (np.nan_to_num(contradicted) > CONTRADICTED) | (share > MOVING) | (tracks.ref_kf < 0)
     is_doubtful |= np.nan_to_num(disagreement) > DISAGREEMENT
-    is_blind = (np.nan_to_num(contradicted) > CONTRADICTED) | (share > MOVING) | (tracks.ref_kf < 0)
+    is_blind = (np.nan_to_num(contradicted) > CONTRADICTED) | (tracks.ref_kf < 0) | ((share > MOVING) & (tracks.n_inliers < SHOWN))
     drift = _drift(tracks, final[1], is_blind) if len(moving) else np.zeros(n)
     is_doubtful |= drift > DOUBTFUL_DRIFT
     sigma = np.where(tracks.ref_kf >= 0, sigma, np.nan)

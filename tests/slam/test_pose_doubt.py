@@ -83,6 +83,9 @@ def test_frames_that_few_landmarks_hold_are_doubtful_and_the_lost_have_no_sigma(
     assert np.flatnonzero(record.is_doubtful).tolist() == [7, 30] and np.flatnonzero(np.isnan(record.sigma)).tolist() == [30]
 
 
+SPARSE = np.where(np.isin(np.arange(FRAMES), range(25, 32)), pose_doubt.SHOWN - 1, 200)  # landmarks that hold each frame
+
+
 def covered(frames: range) -> np.ndarray:
     """Masks in which most of the view moves in these frames."""
     moving = np.zeros((FRAMES, *depth_views.shape(KINECT)), dtype=bool)
@@ -91,13 +94,18 @@ def covered(frames: range) -> np.ndarray:
 
 
 def test_what_lies_beyond_a_stretch_without_a_static_world_is_doubtful_too() -> None:
-    record = judged(room()[1], moving=covered(range(25, 32)))
+    record = judged(room()[1], moving=covered(range(25, 32)), n_inliers=SPARSE)
     assert not record.is_doubtful[:25].any() and record.is_doubtful[25:].all()
     assert record.drift[-1] == pytest.approx(np.sqrt(8) * pose_doubt.STEP_BLIND, rel=0.05)
 
 
+def test_what_lies_beyond_views_that_mostly_move_is_sure_where_many_landmarks_hold_them() -> None:
+    record = judged(room()[1], moving=covered(range(25, 32)), n_inliers=pose_doubt.SHOWN)
+    assert np.flatnonzero(record.is_doubtful).tolist() == list(range(25, 32)) and record.drift.max() < pose_doubt.STEP_BLIND
+
+
 def test_landmarks_seen_before_and_after_tie_both_sides_together() -> None:
-    record = judged(room()[1], moving=covered(range(25, 32)), ties=((20, 35),))
+    record = judged(room()[1], moving=covered(range(25, 32)), n_inliers=SPARSE, ties=((20, 35),))
     assert record.is_doubtful[25:32].all() and not record.is_doubtful[:25].any() and not record.is_doubtful[33:].any()
     assert record.drift.max() < np.sqrt(4) * pose_doubt.STEP_BLIND + 0.01
 
