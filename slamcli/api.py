@@ -7,6 +7,7 @@
 Nothing is printed: progress goes to the `progress` of the caller, single lines to `tell`, warnings to the logger "slamcli".
 """
 
+import copy
 import logging
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -188,7 +189,7 @@ class Run:
 
     def record(self, stage: str) -> dict[str, Any] | None:
         """Read what a stage said of itself: configuration, inputs, outputs, cost, warnings; None before it was run."""
-        return self.directory.record(stage)
+        return copy.deepcopy(self.directory.record(stage))
 
     def summary(self) -> dict[str, dict[str, Any]]:
         """Return the figures that each finished stage counted, by stage."""

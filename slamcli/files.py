@@ -260,9 +260,12 @@ def _parse_json(path: Path, text: str) -> dict[str, Any]:
 # digests
 
 
-def sha256(path: Path) -> str:
-    """Digest a file's content. A file that this process has digested before and that nobody has written to since is not read again."""
-    known = _known.get(version(path))
+def sha256(path: str | Path, found: os.stat_result | None = None) -> str:
+    """Digest a file's content. A file that this process has digested before and that nobody has written to since is not read again.
+
+    found : what `os.stat` says of it now, where that has been asked
+    """
+    known = _known.get(version(path) if found is None else _version(found))
     if known is None:
         with open_regular(path) as file:
             known = _known[version(file.fileno())] = hashlib.file_digest(file, "sha256").hexdigest()
@@ -272,9 +275,12 @@ def sha256(path: Path) -> str:
 def version(path: str | Path | int) -> tuple[int, ...]:
     """Return what changes when somebody writes to a file or replaces it; nothing where it is not there."""
     try:
-        found = os.stat(path)
+        return _version(os.stat(path))
     except FileNotFoundError:
         return ()
+
+
+def _version(found: os.stat_result) -> tuple[int, ...]:
     return found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns, found.st_ctime_ns
 
 
@@ -294,19 +300,27 @@ def read_sealed(path: Path) -> dict[str, Any]:
 
 
 def unsealed(text: str, *, source: Path) -> dict[str, Any]:
-    """Take the JSON object out of what `sealed` gave; SlamError names `source` when a single bit of it is another."""
-    value = _parse_json(source, text)
-    value.pop(SEAL, None)
-    if not _is_seal_whole(text):
+    """Take the JSON object out of what `sealed` gave; SlamError names `source` when a single bit of it is another.
+
+    What its values hold is shared by all who read the same text: it is not to be changed.
+    """
+    try:
+        value = _sealed_content(text)
+    except (ValueError, RecursionError):  # of numbers with thousands of digits too
+        value = None
+    if value is None:
+        _parse_json(source, text)
         raise SlamError(f"{source}: not as slamcli wrote it")
-    return value
+    return dict(value)
 
 
-@functools.lru_cache(maxsize=64)  # a command reads the few records of a run again and again, and writing them out anew is slow
-def _is_seal_whole(text: str) -> bool:
+@functools.lru_cache(maxsize=64)  # a command reads the few records of a run again and again; parsing and writing them out anew is slow
+def _sealed_content(text: str) -> dict[str, Any] | None:
     value = json.loads(text)
+    if not isinstance(value, dict):
+        return None
     value.pop(SEAL, None)
-    return sealed(value) == text
+    return value if sealed(value) == text else None
 
 
 def sealed(value: Mapping[str, Any]) -> str:

@@ -2,6 +2,8 @@
 
 import functools
 import hashlib
+import os
+import stat
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -48,12 +50,16 @@ def is_record(record: Mapping[str, Any]) -> bool:
 def find(folder: Path, outputs: Mapping[str, Any], names: Iterable[str], *, verify: bool) -> str:
     """Say what is wrong with files of a stage's folder, or "": each has its recorded size and, with `verify`, its recorded digest."""
     for name in names:
-        path, entry = folder / name, outputs[name]
-        if not path.is_file():
+        path, entry = os.path.join(folder, name), outputs[name]
+        try:
+            found = os.stat(path)  # once: a run has a hundred files, and they are looked at before each stage
+        except (FileNotFoundError, NotADirectoryError):
+            found = None
+        if found is None or not stat.S_ISREG(found.st_mode):
             return f"{folder.name}/{name} is not there"
-        if path.stat().st_size != entry["bytes"]:
-            return f"{folder.name}/{name} has {path.stat().st_size} bytes, {entry['bytes']} recorded"
-        if verify and sha256(path) != entry["sha256"]:
+        if found.st_size != entry["bytes"]:
+            return f"{folder.name}/{name} has {found.st_size} bytes, {entry['bytes']} recorded"
+        if verify and sha256(path, found) != entry["sha256"]:
             return f"{folder.name}/{name} has other content than recorded"
     return ""
 

@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from slamcli import __version__, files, interruption
@@ -151,9 +152,14 @@ class Pipeline:
             self._opened = self.run.dataset(self.config)
         return self._opened
 
-    def states(self, *, verify: bool = False, until: str | None = None) -> dict[str, State]:
-        """Judge every stage, or those that `until` rests on, looking at the recording and at the files that options name as they are now."""
-        return self.run.states(self.config, verify=verify, until=until, input_digest=self._input_digest)
+    def states(
+        self, *, verify: bool = False, until: str | None = None, known: Mapping[str, State] = MappingProxyType({})
+    ) -> dict[str, State]:
+        """Judge every stage, or those that `until` rests on, looking at the recording and at the files that options name as they are now.
+
+        known : states judged already, which are believed
+        """
+        return self.run.states(self.config, verify=verify, until=until, input_digest=self._input_digest, known=known)
 
     def _input_digest(self, name: str) -> str | None:
         """Digest the recording or a file an option names; None where it is not there, so that what was made from it still stands."""
@@ -190,13 +196,16 @@ class Pipeline:
         if start and last < first_forced:
             raise SlamError(f"--from {start} --until {until}: {until} comes before {start}")
         self._tell(f"{self.run.info()['dataset']} -> {self.run.path}")
+        known: dict[str, State] = {}  # what holds is looked at once; whoever reads a file of it compares it again
         for index, stage in enumerate(STAGES[: last + 1]):
-            state = self.states(verify=True, until=stage.name)[stage.name]
+            known |= self.states(verify=True, until=stage.name, known=known)
+            state = known[stage.name]
             if state.is_fresh and index < first_forced:
                 self._tell(f"{stage.name:<9}  {state.state}")
                 continue
             log.info("%s: %s", stage.name, state.reason or state.state if index < first_forced else "asked for")
             self.run_stage(stage)
+            del known[stage.name]
         if self.recording_note:
             log.warning("%s", self.recording_note)
 

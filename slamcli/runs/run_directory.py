@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from slamcli import files
@@ -43,7 +44,7 @@ class RunDir:
     def __init__(self, path: Path) -> None:
         self.path = Path(path)
         self._warned: set[str] = set()
-        self._judged: dict[str, tuple] = {}  # stages that were found fresh or warned of, with the versions of what says so
+        self._judged: dict[str, tuple[tuple, State]] = {}  # stages judged for a warning, each with the versions of what says so
 
     # which run
 
@@ -264,11 +265,12 @@ class RunDir:
 
     def _warn_unless_fresh(self, stage: str) -> None:
         """Say once that a result is not what the run's configuration would give now."""
-        seen = tuple(files.version(self.path / name) for name in ("config.toml", f"{stage}/stage.json"))
-        if self._judged.get(stage) == seen:
+        known = {name: state for name, (seen, state) in self._judged.items() if seen == self._versions(name)}
+        if stage in known:
             return
-        self._judged[stage] = seen
-        state = self.states(until=stage)[stage]
+        judged = self.states(until=stage, known=known)
+        self._judged |= {name: (self._versions(name), state) for name, state in judged.items()}
+        state = judged[stage]
         if stage in self._warned or state.is_fresh or self.is_cleaned(state):
             return
         if state.reason not in self._warned:  # of several stages that are stale for one reason, one tells it
@@ -276,6 +278,9 @@ class RunDir:
                 "%s: %s is %s (%s); bring it up to date with: slamcli run %s", self.path, stage, state.state, state.reason, self.flag
             )
         self._warned |= {stage, state.reason}
+
+    def _versions(self, stage: str) -> tuple:
+        return files.version(self.path / "config.toml"), files.version(self.path / stage / "stage.json")
 
     def mark_cleaned(self, stage: str) -> None:
         """Remember that a stage was deleted on purpose: what was made from it still stands, and may be exported without a warning."""
@@ -301,14 +306,19 @@ class RunDir:
         verify: bool = False,
         until: str | None = None,
         input_digest: Callable[[str], str | None] = lambda name: None,
+        known: Mapping[str, State] = MappingProxyType({}),
     ) -> dict[str, State]:
         """Judge every stage under `config` (the run's own); without `input_digest` the recording is believed to be unchanged.
 
         until : judge no more than this stage and those that it rests on
+        known : states judged already, which are believed
         """
         config = config or self.config()
         states: dict[str, State] = {}
         for stage in STAGES if until is None else [stage for stage in STAGES if stage.name in basis(until)]:
+            if stage.name in known:
+                states[stage.name] = known[stage.name]
+                continue
             record, found = self._looked_at(stage.name, verify=verify)
             sources = {} if record is None else source_code.of_stage(stage.name, record.get("reader", ""))
             states[stage.name] = staleness.assess(stage, config, record, found, states, input_digest, sources)

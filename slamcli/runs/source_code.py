@@ -37,8 +37,9 @@ APART = frozenset(
     }
 )
 
-FOR_TYPE_CHECKERS = re.compile(r"^( *)if TYPE_CHECKING:\n(?:\1 +.*\n|\n)+", re.MULTILINE)
-IMPORT = re.compile(r"^ *(?:from +(slamcli[\w.]*) +import +(\([^)]*\)|.*)|import +(slamcli[\w.]*))", re.MULTILINE)
+# Both begin with the end of the line before, a letter that is looked for four times as quickly as the place after it.
+FOR_TYPE_CHECKERS = re.compile(r"\n( *)if TYPE_CHECKING:\n(?:\1 +.*\n|\n)+")
+IMPORT = re.compile(r"\n *(?:from +(slamcli[\w.]*) +import +(\([^)]*\)|.*)|import +(slamcli[\w.]*))")
 
 
 @functools.cache
@@ -95,7 +96,7 @@ def imported(file: str) -> frozenset[str]:
 
 def _modules(text: str) -> Iterator[str]:
     """Return the dotted names that import statements mention; of ``from a import b`` both a and a.b, which may be no module."""
-    for statement in IMPORT.finditer(FOR_TYPE_CHECKERS.sub("", text)):
+    for statement in IMPORT.finditer(FOR_TYPE_CHECKERS.sub("\n", f"\n{text}")):
         home, names, plain = statement.groups()
         if plain:
             yield plain
