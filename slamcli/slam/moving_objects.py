@@ -29,6 +29,7 @@ LATER, MUCH_LATER = (1.5, 2.0, 2.6, 3.3), (4.0, 5.0, 6.5, 8.0, 10.0, 13.0, 16.0)
 LONG = 0.3  # [s] apart, from which on what is seen again in its place counts as still: a stride takes 0.5 s
 MIN_STILL = 2  # views long before or after that find a place again where it is still
 GROUP_JUMP = 0.1  # of the depth, between neighbouring places of one group
+SPREAD_JUMP, SPREAD_MOST = 0.015, 30  # of the depth, between neighbouring places that it spreads over, less than the floor's slant; and places
 OUTLINE, ENCLOSED = 3, 4  # of its eight neighbours move: so does a place without depth, beside the background and elsewhere
 MOST = 0.6  # of the surface seen [m^2]: when more seems to move, it is the pose that is wrong
 MAP_MARGIN = 2  # places around what moves that maps leave out: other views show what stands there
@@ -46,15 +47,17 @@ class Rule:
     weight_still: float  # such views a place needs for each one that finds it again
     min_group: int  # connected places: less is noise along edges
     followed: float  # [s] before it goes, and after it came, over which what moves is recognized where it stands
+    spreads: bool = False  # over what is connected with it and no view some time apart confirms
 
 
 # Whether anything moves is asked of every recording, and poses that err are not to answer it.
 AT_ALL = Rule(QUICK_AFTER, min_through=1, weight_still=1.0, min_group=12, followed=0.0)
 # Poses that drift agree about views that are near in time only.
 UNDER_DRIFT = Rule(AFTER, min_through=1, weight_still=0.3, min_group=12, followed=1.0)
-# Poses may rest on what stands a while, but on nothing that moves. Maps show nothing that a later view looks through, and miss no view.
+# Poses may rest on what stands a while, but on nothing that moves. Maps show nothing that a later view looks through, and miss no view:
+# what is seen in one view alone, a leg at the picture's lower edge, need not be in them.
 FOR_POSES = Rule((*AFTER, *LATER), min_through=1, weight_still=1.0, min_group=12, followed=4.0)
-FOR_MAPS = Rule((*AFTER, *LATER, *MUCH_LATER), min_through=2, weight_still=0.15, min_group=4, followed=np.inf)
+FOR_MAPS = Rule((*AFTER, *LATER, *MUCH_LATER), min_through=2, weight_still=0.15, min_group=4, followed=np.inf, spreads=True)
 
 
 def is_any(views: Views) -> bool:
@@ -82,6 +85,8 @@ def find(views: Views, progress: Callable[[range], Iterable[int]] = iter, *, rul
         z = sightings.z(frame)
         if _is_most(found, z):
             found[:] = sightings.is_moving[frame]
+        if rule.spreads and found.any():
+            found |= kernels.grow(found, sightings.is_unconfirmed[frame], z, SPREAD_JUMP, SPREAD_MOST)
         found |= _outline(found, z)
     return moving
 

@@ -37,22 +37,23 @@ TIE_SIGMA = 0.003  # [m] of their relative pose
 DOUBTFUL_DRIFT = 0.028  # [m]
 
 
-def judge(views: Views, moving: np.ndarray, first: tuple[Tracks, Map], final: tuple[Tracks, Map]) -> Doubt:
+def judge(views: Views, moving: np.ndarray, hidden: np.ndarray, first: tuple[Tracks, Map], final: tuple[Tracks, Map]) -> Doubt:
     """Weigh the signs for every frame.
 
-    views : with the final poses; moving : (F, v, u) bool, without rows where nothing moves
+    views : with the final poses; moving : (F, v, u) bool, without rows where nothing moves, as the maps leave it out
+    hidden : the same, as tracking and the final pass left it out, who take less for moving
     first, final : the poses of tracking and of the final pass
     """
     tracks, n = final[0], len(views.stamp)
     contradicted = _contradicted(views, moving)
     disagreement = _disagreement(views.stamp, first, final)
-    share = moving.mean(axis=(1, 2)) if len(moving) else np.zeros(n)
+    share = hidden.mean(axis=(1, 2)) if len(hidden) else np.zeros(n)
     support = np.minimum(LANDMARK_SIGMA / np.maximum(tracks.n_inliers, 1), np.where(_on_depth(*final), DEPTH_SIGMA, WORST_SIGMA))
     sigma = np.sqrt(BASE_SIGMA**2 + support**2 + np.nan_to_num(disagreement) ** 2)
     is_doubtful = (sigma > DOUBTFUL_SIGMA) | (np.nan_to_num(contradicted) > CONTRADICTED) | (share > MOVING) | (tracks.ref_kf < 0)
     is_doubtful |= np.nan_to_num(disagreement) > DISAGREEMENT
     is_blind = (np.nan_to_num(contradicted) > CONTRADICTED) | (tracks.ref_kf < 0) | ((share > MOVING) & (tracks.n_inliers < SHOWN))
-    drift = _drift(tracks, final[1], is_blind) if len(moving) else np.zeros(n)
+    drift = _drift(tracks, final[1], is_blind) if len(hidden) else np.zeros(n)
     is_doubtful |= drift > DOUBTFUL_DRIFT
     sigma = np.where(tracks.ref_kf >= 0, sigma, np.nan)
     return Doubt(

@@ -13,7 +13,7 @@ from slamcli.slam.doubt import Finding
 
 FROZEN_FRAMES, FROZEN_SECONDS = 8, 0.25  # equal images in a row: shorter stretches are those of a stream whose rate was raised
 FEW_FEATURES = 20  # a picture with fewer may be blank, and blank pictures are equal
-LINE_STEP, PAIR_STEP = 8, 4  # every eighth row of a depth image and every fourth pair of neighbours in it are enough to judge its readings
+LINES, PAIRS = 30, 80  # rows of a depth image, and pairs of neighbours in each, that are enough to judge its readings
 ONE_DISTANCE = 1e-3  # spread of an image's readings as a share of them: sensors scatter more even before a wall
 ROUGH = 0.1  # difference of neighbouring readings as a share of them, median; real depth has 0.01 at most, noise 0.3 and more
 MOSTLY = 0.5  # share of the images from which all are called so
@@ -35,8 +35,9 @@ NO_READINGS = Readings(0.0, np.nan, np.nan, np.nan)
 
 def look(depth: np.ndarray) -> Readings:
     """Judge a depth image (H, W) float32 [m], NaN = none, by some of its pairs of neighbours."""
-    lines = depth[LINE_STEP // 2 :: LINE_STEP]
-    first, second = lines[:, :-1:PAIR_STEP], lines[:, 1::PAIR_STEP]
+    line_step, pair_step = (max(n // wanted, 1) for n, wanted in zip(depth.shape, (LINES, PAIRS), strict=True))
+    lines = depth[line_step // 2 :: line_step]
+    first, second = lines[:, :-1:pair_step], lines[:, 1::pair_step]
     is_read = np.isfinite(first)
     if not is_read.any():
         return NO_READINGS

@@ -39,7 +39,7 @@ def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
 
         made = grid_from_octree(octomap.read(inputs.path("octree", "map.ot")), settings=cfg.grid2d)
     else:
-        made, summary["views"] = _from_depth(inputs, ground.T_lw, cfg, tools)
+        made, summary["views"] = _from_depth(inputs, ground, cfg, tools)
     T_lc = product(ground.T_lw, frame_poses(inputs.load(Tracks, "loop"), inputs.load(Map, "loop")))
     made = mark_driven(made, T_lc[:, :2, 3], settings=cfg.grid2d)
     counts = {name: int((made.state == state).sum()) for name, state in (("occupied", grid.OCCUPIED), ("free", grid.FREE))}
@@ -53,8 +53,9 @@ def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
     return {**summary, "columns": columns, "rows": rows, **counts, "floor": bool(ground.is_found)}
 
 
-def _from_depth(inputs: Inputs, T_lw: np.ndarray, cfg: Config, tools: Tools) -> tuple[Grid, int]:
-    option, depths = cfg.grid2d, DepthFrames.of(inputs, tools)
+def _from_depth(inputs: Inputs, ground: Ground, cfg: Config, tools: Tools) -> tuple[Grid, int]:
+    option, depths, T_lw = cfg.grid2d, DepthFrames.of(inputs, tools), ground.T_lw
+    floor_height = option.band_low if ground.is_found else None
     rays = np.ascontiguousarray(depths.camera.rays)
     depth_stamp, moving = inputs.load(FrameTimes, "loop").depth_stamp, depths.moving.moving
     has_depth = np.isfinite(depth_stamp)
@@ -79,7 +80,7 @@ def _from_depth(inputs: Inputs, T_lw: np.ndarray, cfg: Config, tools: Tools) -> 
             return look(depth, rays, T_ld, settings=option, sensor=cfg.sensor, floor=floor)
 
         spaced = tools.progress([poses[row] for row in chosen.tolist()], "grid2d")
-        for view in depths.look_at(spaced, look_at):
+        for view in depths.look_at(spaced, look_at, floor=floor_height):
             n_views += 1
             yield view
 

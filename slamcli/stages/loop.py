@@ -55,7 +55,8 @@ def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
         tools.warn(apart)
     moving, motion = find_moving(inputs, tracks, map_, several, tools)
     first = inputs.load(Tracks, "track"), inputs.load(Map, "track")
-    doubts = pose_doubt.judge(moving_parts.views(inputs, tracks, map_), moving.moving, first, (tracks, map_))
+    hidden = inputs.load(Moving, "track").moving
+    doubts = pose_doubt.judge(moving_parts.views(inputs, tracks, map_), moving.moving, hidden, first, (tracks, map_))
     for artifact in (moving, doubts, when, closures_of(accepted)):
         artifacts.save(artifact, out)
     write_camera(out, camera)

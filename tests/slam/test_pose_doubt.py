@@ -48,7 +48,7 @@ def found(
 
 def judged(T_wc: np.ndarray, *, first: np.ndarray | None = None, moving: np.ndarray = NOTHING, **held: object) -> Doubt:
     poses = found(T_wc, **held)
-    return pose_doubt.judge(replace(room()[0], T_wc=T_wc), moving, poses if first is None else found(first), poses)
+    return pose_doubt.judge(replace(room()[0], T_wc=T_wc), moving, moving, poses if first is None else found(first), poses)
 
 
 def test_right_poses_are_sure() -> None:
@@ -79,7 +79,7 @@ def test_frames_that_few_landmarks_hold_are_doubtful_and_the_lost_have_no_sigma(
     ref_kf = tracks.ref_kf.copy()
     ref_kf[30] = -1
     poses = replace(tracks, ref_kf=ref_kf), map_
-    record = pose_doubt.judge(room()[0], NOTHING, poses, poses)
+    record = pose_doubt.judge(room()[0], NOTHING, NOTHING, poses, poses)
     assert np.flatnonzero(record.is_doubtful).tolist() == [7, 30] and np.flatnonzero(np.isnan(record.sigma)).tolist() == [30]
 
 

@@ -19,6 +19,7 @@ from slamcli.dense import occupancy
 from slamcli.formats import cloud, octomap
 from slamcli.geometry import se3
 from slamcli.schema import FrameTimes, Ground, Map, Moving, Timing, Tracks
+from slamcli.slam import depth_views
 from slamcli.stages import densify, octree
 from slamcli.stages.depth_frames import DepthFrames, depth_poses
 
@@ -170,6 +171,28 @@ def test_the_octree_agrees_with_the_images_it_was_made_from(done: Done) -> None:
     result = occupancy.accuracy(tree, scans, max_range=CFG.octree.max_range)
     assert 0.97 < result.share < 1.0
     assert result.unknown == 0
+
+
+def test_the_floor_at_the_feet_of_what_moves_is_kept_but_not_what_it_stands_on(done: Done) -> None:
+    dataset, camera = done.inputs.dataset, done.inputs.camera()
+    T_lw = artifacts.load(Ground, done.folder / "densify").T_lw
+    poses = [(frame, T_lw @ T_wk) for frame, T_wk in depth_poses(done.inputs)][::12]
+    everything = np.ones((len(dataset), *depth_views.shape(camera)), dtype=bool)
+    depths = DepthFrames(dataset, camera, Moving(everything))
+    without, kept = (list(depths.look_at(poses, lambda _, depth, __: depth, floor=floor)) for floor in (None, 0.05))
+    n_kept = n_under = 0
+    for (frame, T_lk), depth, nothing in zip(poses, kept, without, strict=True):
+        assert np.isnan(nothing[4:-4, 4:-4]).all()  # the mask ends before the picture does
+        true = dataset.depth(frame, camera)
+        x = T_lk[:3, :3] @ (true * np.dstack([camera.rays, np.ones_like(true)]).transpose(2, 0, 1)).reshape(3, -1) + T_lk[:3, 3:]
+        is_hidden, is_floor = np.isnan(nothing).ravel() & np.isfinite(true).ravel(), np.abs(x[2]) <= 0.05
+        place = [tuple(cell) for cell in np.floor(np.nan_to_num(x[:2].T) / 0.05).astype(int).tolist()]
+        taken = {place[k] for k in np.flatnonzero(is_hidden & ~is_floor)}
+        is_under = np.array([cell in taken for cell in place])
+        wanted = is_hidden & is_floor & ~is_under
+        np.testing.assert_array_equal(np.isfinite(depth).ravel() & is_hidden, wanted)
+        n_kept, n_under = n_kept + wanted.sum(), n_under + (is_hidden & is_floor & is_under).sum()
+    assert n_kept > 10_000 and n_under > 20
 
 
 def test_the_depth_delay_that_optimize_found_is_taken_out_of_the_poses(recording: Path, tmp_path: Path) -> None:
