@@ -101,6 +101,7 @@ def _add_points(
 ):
     """Add weighted points to their voxels; sums are weight, offset from the centre [voxels], normal, colour. Returns the rows in use."""
     half = 1 << 20
+    last, row = np.int64(-1), np.int64(-1)
     for i in range(len(pixel)):
         x, y, z = xyz_c[i, 0], xyz_c[i, 1], xyz_c[i, 2]
         px = (T_wc[0, 0] * x + T_wc[0, 1] * y + T_wc[0, 2] * z + T_wc[0, 3]) * per_side
@@ -110,8 +111,9 @@ def _add_points(
         if not (abs(fx) < half and abs(fy) < half and abs(fz) < half):
             continue
         key = spread(int(fx) + half) | spread(int(fy) + half) << 1 | spread(int(fz) + half) << 2
-        row = find_or_add(slot_row, row_key, n_rows, key)
-        n_rows = max(n_rows, row + 1)
+        if key != last:  # neighbouring pixels often show the same voxel
+            last, row = key, np.int64(find_or_add(slot_row, row_key, n_rows, key))
+            n_rows = max(n_rows, row + 1)
         w = weight[i]
         a, b, c = normal_c[i, 0], normal_c[i, 1], normal_c[i, 2]
         sums[row, 0] += w
