@@ -35,7 +35,9 @@ OUTLINE, ENCLOSED = 3, 4  # of its eight neighbours move: so does a place withou
 MOST = 0.6  # of the surface seen [m^2]: when more seems to move, it is the pose that is wrong
 MAP_MARGIN = 2  # places around what moves that maps leave out: other views show what stands there
 QUICK_EVERY, QUICK_AFTER = 4, (0.35, 0.8)  # frames looked at first, and [s] as AFTER, to see whether anything moves at all
-QUICK_SHARE, QUICK_FRAMES = 0.02, 2  # a recording has moving objects when this share of a view moves in so many of these frames
+# A recording has moving objects when this share of a view moves in so many of these frames, no farther apart than so many seconds: what
+# moves is in view for a while, and single frames that only seem to show it, one in hundreds, come together in any long recording.
+QUICK_SHARE, QUICK_FRAMES, QUICK_SPAN = 0.02, 2, 1.0
 OUT_OF_SIGHT = -1e4  # [px] where no search looks
 
 
@@ -63,12 +65,14 @@ FOR_MAPS = Rule((*AFTER, *LATER, *MUCH_LATER), min_through=2, weight_still=0.15,
 
 def is_any(views: Views) -> bool:
     """Say whether anything moves in a recording, after a look at some of its frames."""
-    found = 0
+    found: list[float] = []
     for frame in range(0, len(views.stamp), QUICK_EVERY):
         evidence = weigh(views, frame, AT_ALL.after)
         if evidence is not None and _surely_moving(evidence, AT_ALL).mean() > QUICK_SHARE:
-            found += 1
-    return found >= QUICK_FRAMES
+            found.append(float(views.stamp[frame]))
+            if len(found) >= QUICK_FRAMES and found[-1] - found[-QUICK_FRAMES] <= QUICK_SPAN:
+                return True
+    return False
 
 
 def find(views: Views, progress: Callable[[range], Iterable[int]] = iter, *, rule: Rule = FOR_POSES) -> np.ndarray:

@@ -81,6 +81,14 @@ def test_what_stands_still_while_it_is_seen_is_kept(who: str) -> None:
     assert not moving_objects.is_any(views) and not moving_objects.find(views).any()
 
 
+@pytest.mark.parametrize(("frames", "moves"), [((8,), False), ((8, 28), False), ((8, 12), True)])
+def test_single_frames_that_seem_to_show_motion_far_apart_are_none(frames: tuple[int, ...], moves: bool) -> None:
+    views, _ = recording("nobody")
+    T_wc = views.T_wc.copy()
+    T_wc[list(frames), 2, 3] += 0.25  # a pose that is wrong makes everything in its view seem to have moved
+    assert moving_objects.is_any(replace(views, T_wc=T_wc)) == moves
+
+
 def test_who_stood_half_the_time_is_kept_for_poses_and_not_for_maps() -> None:
     views, truth = recording("leaving")
     views = replace(views, stamp=6.0 * views.stamp)  # leaves after seven of fourteen seconds
