@@ -17,6 +17,7 @@ from slamcli.sparse_map.guided_matching import Landmarks
 from slamcli.sparse_map.sparse_map import SparseMap
 
 NEIGHBOURS = 20  # covisible key frames whose landmarks are looked for
+AT_ONCE = 64  # frames of one key frame that a thread refines, so that the others find work, too
 LOST_WIDENING = 8.0  # a lost frame's neighbour stands where a frame's fast turn leaves it, some tens of pixels off
 
 
@@ -65,9 +66,11 @@ class _FrameRefinement:
         """Refine those of the frames wanted (F,) that landmarks hold."""
         # The few landmarks around a frame on depth would make its pose worse.
         chosen = np.flatnonzero((self._state != LOST) & (self._state != ON_DEPTH) & is_wanted)
-        # No frame depends on another; those that follow one another on one key frame share the landmarks around it.
-        spans = np.split(chosen, np.flatnonzero(np.diff(self._ref_kf[chosen])) + 1)
-        refined = ordered_map(self._refine_span, spans, workers=workers)
+        # No frame depends on another; those that stand on one key frame, whenever that was, share the landmarks around it.
+        chosen = chosen[np.argsort(self._ref_kf[chosen], kind="stable")]
+        of_each = np.split(chosen, np.flatnonzero(np.diff(self._ref_kf[chosen])) + 1)
+        groups = [group[k : k + AT_ONCE] for group in of_each for k in range(0, len(group), AT_ONCE)]
+        refined = ordered_map(self._refine_group, groups, workers=workers)
         for i, estimate in progress(chain.from_iterable(refined), "final refinement", len(chosen)):
             if estimate is not None:
                 self._record(i, int(self._ref_kf[i]), estimate)
@@ -93,12 +96,10 @@ class _FrameRefinement:
         self._T_wc[moved] = T_wc[moved]
         self._T_kc[moved] = product(se3.inverse(self._sparse_map.kf.T_wk[self._ref_kf[moved]]), T_wc[moved])
 
-    def _refine_span(self, span: np.ndarray) -> list[tuple[int, PoseEstimate | None]]:
+    def _refine_group(self, group: np.ndarray) -> list[tuple[int, PoseEstimate | None]]:
         """Look for frames that stand on one key frame where they stand; returns each with its pose, None if it is not there."""
-        if len(span) == 0:
-            return []
-        landmarks, found = self._landmarks_around(int(self._ref_kf[span[0]])), []
-        for i in span.tolist():
+        landmarks, found = self._landmarks_around(int(self._ref_kf[group[0]])), []
+        for i in group.tolist():
             least = self._settings.depth_icp_below if self._state[i] == KEY_FRAME else 0
             found.append((i, self._find(i, self._T_wc[i], landmarks, least=least)))
         return found

@@ -123,13 +123,14 @@ class LoopCloser:
         return list(itertools.compress(closures, is_kept))
 
     def _fuse_and_adjust(self, closures: list[Candidate]) -> None:
-        """Fuse what both sides of the closures see, and adjust the whole map."""
+        """Fuse what both sides of the closures see, and adjust the whole map, to its optimum unless the final refinement does that."""
         sparse_map = self._sparse_map
         for closure in closures:
             self._fuse_around(closure)
         sparse_map.refresh(np.flatnonzero(sparse_map.lm.is_alive).astype(np.int32))
-        kfs = np.arange(len(sparse_map.kf), dtype=np.int32)
-        map_adjustment.adjust(sparse_map, kfs, self._frames.camera, self._frames.sensor, max_iterations=self._settings.iterations)
+        kfs, most = np.arange(len(sparse_map.kf), dtype=np.int32), self._settings.iterations
+        tolerance = map_adjustment.NEARLY if self._settings.final_refinement else map_adjustment.CONVERGED
+        map_adjustment.adjust(sparse_map, kfs, self._frames.camera, self._frames.sensor, max_iterations=most, tolerance=tolerance)
 
     def _fuse_around(self, closure: Candidate) -> None:
         """Find the landmarks of each side in the key frames of the other side."""

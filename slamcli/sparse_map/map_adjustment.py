@@ -17,6 +17,8 @@ from slamcli.geometry.camera import Camera
 from slamcli.schema import Features
 from slamcli.sparse_map.sparse_map import SparseMap
 
+CONVERGED, NEARLY = 1e-5, 1e-3  # share of the cost that an iteration lowers it by: at the optimum; where another adjustment follows
+
 
 def measure(features: Features, rows: np.ndarray | slice, sensor: SensorConfig) -> Measurements:
     """Look up the measurements of feature `rows` (indices or a slice) with their standard deviations."""
@@ -89,11 +91,19 @@ def landmarks_alone(part: Part, first: int, end: int) -> Part:
 
 
 def adjust(
-    sparse_map: SparseMap, moving: np.ndarray, camera: Camera, sensor: SensorConfig, *, max_iterations: int, edge_weight: float = 1.0
+    sparse_map: SparseMap,
+    moving: np.ndarray,
+    camera: Camera,
+    sensor: SensorConfig,
+    *,
+    max_iterations: int,
+    edge_weight: float = 1.0,
+    tolerance: float = CONVERGED,
 ) -> bundle_adjustment.BundleResult | None:
     """Adjust the key frames `moving` and all they see, in place, and remove the observations found to be outliers.
 
     edge_weight : factor on the information of edges between key frames
+    tolerance : share of the cost; an iteration that lowers it by less ends the adjustment
     Returns the evidence, or None where nothing ties two key frames together.
     """
     part = gather(sparse_map, moving, sensor)
@@ -107,6 +117,7 @@ def adjust(
         is_fixed=part.is_fixed,
         edges=replace(part.edges, information=edge_weight * part.edges.information),
         max_iterations=max_iterations,
+        tolerance=tolerance,
     )
     before = sparse_map.kf.T_wk[part.kfs].copy()
     sparse_map.kf.T_wk[part.kfs[~part.is_fixed]] = se3.inverse(result.T_cw[~part.is_fixed])

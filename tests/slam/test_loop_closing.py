@@ -138,6 +138,18 @@ def test_final_refinement_finds_the_same_with_any_number_of_threads(turn):
             np.testing.assert_array_equal(getattr(other, name), getattr(found[0], name))
 
 
+def test_frames_of_one_key_frame_are_refined_together_whenever_they_were(turn, monkeypatch):
+    scene, tracks, map_ = turn
+    back_and_forth = replace(tracks, ref_kf=np.arange(len(tracks.ref_kf), dtype=np.int32) % 2 * tracks.ref_kf)
+    asked, covisible = [], SparseMap.covisible
+    monkeypatch.setattr(SparseMap, "covisible", lambda self, kf: (asked.append(kf), covisible(self, kf))[1])
+    look = (SparseMap.from_map(scene.features, map_), scene.frames(SENSOR), back_and_forth, TrackConfig(), lambda items, *_: items)
+    frame_refinement.refine_frames(*look)
+    n_frames = np.bincount(back_and_forth.ref_kf)
+    assert n_frames[0] > 1
+    assert len(asked) == sum(-(-n // frame_refinement.AT_ONCE) for n in n_frames), "once for so many frames of a key frame"
+
+
 def test_final_refinement_matches_key_frames_again_and_the_world_stays_where_it_is(turn):
     scene, tracks, map_ = turn
     sparse_map = SparseMap.from_map(scene.features, map_)

@@ -186,3 +186,11 @@ def test_what_was_refused_is_tried_again_on_the_corrected_map(monkeypatch):
     rounds = Rounds(monkeypatch, alike=[(50, 2), (30, 20)], refused=((50, 2),), rounds=2)
     rounds.closer.close_loops()
     assert rounds.tried == [(50, 2), (30, 20), (50, 2)]
+
+
+@pytest.mark.parametrize(("is_refined", "tolerance"), [(True, map_adjustment.NEARLY), (False, map_adjustment.CONVERGED)])
+def test_the_map_comes_to_its_optimum_once(monkeypatch, is_refined, tolerance):
+    rounds, given = Rounds(monkeypatch, alike=[(50, 2)], final_refinement=is_refined), []
+    monkeypatch.setattr(map_adjustment, "adjust", lambda *_, **how: given.append(how["tolerance"]))
+    rounds.closer.close_loops()
+    assert given == [tolerance]
