@@ -1,5 +1,6 @@
 """Records of arrays as folders of `.npy`, one file a field. A record's type is its schema; it is checked at every save and load."""
 
+import mmap
 from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
@@ -96,3 +97,21 @@ def _read(path: Path) -> np.ndarray:
         raise ValueError(f"{path.name}: {error}") from error
     except OSError as error:
         raise SlamError(f"{path}: cannot be read ({files.told(error)})") from error
+
+
+def release(value: Any) -> None:
+    """Let go of the memory that the mapped fields of a record hold so far; what is read again comes from the file.
+
+    For fields that are read alone: what was written to one would be forgotten. Other threads may read them meanwhile.
+    """
+    for spec in fields(value):
+        if (mapped := _map_of(getattr(value, spec.name))) is not None:
+            mapped.madvise(mmap.MADV_DONTNEED)
+
+
+def _map_of(column: np.ndarray) -> mmap.mmap | None:
+    """Return the map that an array is a view of, None where it is of no file or where the system takes no advice."""
+    base: Any = column
+    while isinstance(base, np.ndarray):
+        base = base.base
+    return base if isinstance(base, mmap.mmap) and hasattr(mmap, "MADV_DONTNEED") else None

@@ -3,6 +3,7 @@
 import dataclasses
 import io
 import pickle
+import resource
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -169,3 +170,24 @@ def test_every_core_type_declares_dtype_shape_and_meaning_of_each_field() -> Non
         for spec in dataclasses.fields(kind):
             assert isinstance(spec.metadata["dtype"], np.dtype), f"{kind.__name__}.{spec.name}"
             assert spec.metadata["meaning"], f"{kind.__name__}.{spec.name}"
+
+
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="the system does not tell")
+def test_what_is_released_takes_no_memory_until_it_is_read_again(tmp_path: Path) -> None:
+    def mapped() -> int:
+        return int(Path("/proc/self/statm").read_text().split()[2]) * resource.getpagesize()
+
+    rows = 1 << 21
+    artifacts.save(ragged(2, rows), tmp_path)
+    back, before = artifacts.load(Ragged, tmp_path), mapped()
+    total, size = float(back.xy.sum(dtype="f8")), back.xy.nbytes
+    assert mapped() - before > 0.9 * size
+    artifacts.release(back)
+    assert mapped() - before < 0.1 * size
+    assert float(back.xy.sum(dtype="f8")) == total
+
+
+def test_what_is_in_no_file_is_kept() -> None:
+    value = ragged()
+    artifacts.release(dataclasses.replace(value, xy=value.xy[1:]))
+    np.testing.assert_array_equal(value.xy, ragged().xy)
