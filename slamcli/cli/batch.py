@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from contextlib import AbstractContextManager
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -86,13 +87,19 @@ def _order(out: str, config_name: str | None, assignments: tuple[str, ...], data
     import os
 
     from slamcli.batch.jobs import Order, absolute_out
+    from slamcli.batch.storage import is_url
     from slamcli.config import toml
+    from slamcli.runs.run_directory import refuse_inside
+
+    out = absolute_out(out)
+    if not is_url(out):
+        refuse_inside(Path(out, "batch.csv"))
 
     config = toml.read(toml.find(config_name)) if config_name else None
     toml.resolve(config, None, assignments)
     data = data or os.environ.get("SLAMCLI_DATA")
     folder = os.path.abspath(data) if data else None
-    return Order(absolute_out(out), settings=assignments, config=config, data=folder, until=until, threads=threads)
+    return Order(out, settings=assignments, config=config, data=folder, until=until, threads=threads)
 
 
 def _plan(found: list[Job]) -> str:

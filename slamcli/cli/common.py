@@ -125,13 +125,14 @@ def told_in(folder: RunDir, T_wc: np.ndarray, frame: str, mount: tuple[float, ..
 
 
 class Target(click.Path):
-    """A file that a command is to write: nowhere in a run directory, which holds what the run's own commands put there.
+    """A file or folder that a command is to write: nowhere in a run directory, which holds what the run's own commands put there.
 
     own : the name under which the command itself puts it into a run directory, where it may be named, too
+    is_folder : a folder, no file
     """
 
-    def __init__(self, *, own: str = "") -> None:
-        super().__init__(path_type=Path, dir_okay=False, readable=False)
+    def __init__(self, *, own: str = "", is_folder: bool = False) -> None:
+        super().__init__(path_type=Path, dir_okay=is_folder, file_okay=not is_folder, readable=False)
         self.own = own
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:

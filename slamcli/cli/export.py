@@ -96,7 +96,7 @@ def _export_graph(out: Path, folder: RunDir, *, is_plain: bool, as_json: bool) -
     tell_written(out, as_json, f"{out.stat().st_size} bytes", bytes=out.stat().st_size, frame="world", format="g2o")
 
 
-out_folder = click.argument("out", type=click.Path(path_type=Path, file_okay=False))
+out_folder = click.argument("out", type=Target(is_folder=True))
 frames_option = click.option(
     "--frames",
     type=click.Choice(["key", "all"]),

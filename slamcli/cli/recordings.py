@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from slamcli.cli.common import complete_target, json_option, recording_options
+from slamcli.cli.common import Target, complete_target, json_option, recording_options
 
 
 @click.command("formats", short_help="List the layouts of recordings that open, and how each is recognised.")
@@ -32,7 +32,7 @@ def formats(as_json: bool) -> None:
 
 @click.command("convert", short_help="Write a recording of any layout in the TUM layout.")
 @click.argument("recording", shell_complete=complete_target)
-@click.argument("out", type=click.Path(path_type=Path))
+@click.argument("out", type=Target(is_folder=True))
 @click.option("--data", metavar="DIR", help="Folder of recordings. [default: $SLAMCLI_DATA, ./data, the user's cache]")
 @recording_options
 def convert(recording: str, out: Path, data: str | None, selection: dict[str, Any]) -> None:

@@ -5,9 +5,11 @@ from typing import Any
 
 import click
 
+from slamcli.cli.common import Target
+
 
 @click.command(short_help="Render a simulated recording with exact truth.")
-@click.argument("out", type=click.Path(path_type=Path))
+@click.argument("out", type=Target(is_folder=True))
 @click.option("--seed", default=0, show_default=True, help="Each seed gives another room.")
 @click.option("--frames", type=int, help="Images to take. [default: 360; with --speed or --turn-rate as many as the drive needs]")
 @click.option("--laps", type=float, help="Rounds driven; more than 1 closes the loop. [default: 1.09; of a building 2]")

@@ -80,6 +80,8 @@ class RunDir:
         if not _is_run(run.path):
             if run.path.is_dir() and any(not entry.name.startswith(".") for entry in run.path.iterdir()):
                 raise SlamError(f"{path}: the folder is not empty and not a run directory; name another with -r")
+            if run.path.parent.name != RECORDINGS:  # where a run of several has those of each
+                refuse_inside(run.path)
             run.path.mkdir(parents=True, exist_ok=True)
             run._write_info(about)
             return run
@@ -445,7 +447,7 @@ def _has_stage(path: Path) -> bool:
 
 
 def refuse_inside(path: Path, *, own: str = "") -> None:
-    """Raise SlamError where a file to be written lies in a run directory, except by the name `own` in its top folder."""
+    """Raise SlamError where a file or folder to be written lies in a run directory, except by the name `own` in its top folder."""
     real = Path(os.path.realpath(path))
     for folder in real.parents:
         if (folder / "run.json").is_file() and (folder / "config.toml").is_file() and (real.name != own or folder != real.parent):

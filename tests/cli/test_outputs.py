@@ -112,6 +112,23 @@ def test_the_run_s_own_files_are_never_a_target(slamcli: Slamcli, room_run: Path
         assert "lies in the run directory" in result.stderr
 
 
+def test_no_folder_is_made_within_a_run(slamcli: Slamcli, room_run: Path, room: Path) -> None:
+    before = sorted(room_run.rglob("*"))
+    for arguments in (
+        ["export-colmap", room_run / "model", "-r", room_run],
+        ["export-nerfstudio", room_run / "densify" / "scene", "-r", room_run],
+        ["convert", room, room_run / "recording"],
+        ["simulate", room_run / "room", "--frames", "2"],
+        ["batch", room, "--out", room_run],
+        ["batch", room, "--out", room_run / "week"],
+        ["run", room, "-r", room_run / "loop" / "again"],
+    ):
+        result = slamcli(*arguments)
+        assert result.exit_code == 1
+        assert "lies in the run directory" in result.stderr
+    assert sorted(room_run.rglob("*")) == before
+
+
 def test_the_report_and_the_plan_may_go_where_they_go_by_themselves(slamcli: Slamcli, room_run: Path, tmp_path: Path) -> None:
     run = shutil.copytree(room_run, tmp_path / "run")
     assert slamcli("report", "-r", run, "-o", run / "report.html").exit_code == 0
