@@ -98,7 +98,7 @@ def tried(stand: Stand, command: Command, free: int) -> tuple[bool, list[str]]:
     elif ended.status not in (0, 1):
         faults.append(f"status {ended.status}: {ended.said[-300:]}")
     elif ended.status == 1:
-        lines = [line for line in ended.said.splitlines() if line.startswith("Error")]
+        lines = [line for line in ended.said.splitlines() if line.startswith("Error") or ": failed: " in line]  # the latter of a batch
         if len(lines) != 1 or "No space left" not in lines[0] or "/" not in lines[0]:
             faults.append(f"not one line that names the place: {ended.said[-300:]}")
     now = stand.contents()

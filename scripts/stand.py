@@ -126,6 +126,9 @@ class Stand:
         if command[0] == "add":
             shutil.rmtree("grown", ignore_errors=True)
             shutil.copytree("grown.before", "grown")
+        if command[0] == "batch":  # else there is nothing to do for it
+            for folder in Path("week").glob("*/densify"):
+                shutil.rmtree(folder)
 
     def contents(self, *tops: str) -> dict[str, str]:
         """Digest what must be the same whenever it is made."""

@@ -55,6 +55,8 @@ def _not_a_recording(path: Path) -> str:
         return f"{path}: an archive; unpack it and give the folder of the recording"
     if path.is_file():
         return f"{path}: not a recording; give the folder of one, or a file of a kind that opens (see: slamcli formats)"
+    if not path.is_dir():
+        return f"{path}: a device or a pipe; give the folder of a recording, or a file of a kind that opens (see: slamcli formats)"
     inner = [entry.name for entry in sorted(path.iterdir()) if entry.is_dir() and reader_of(entry) is not None]
     hint = f"; recordings are in it: {', '.join(inner[:3])}" if inner else ""
     return f"{path}: not a recording{hint}; see what opens and how it is told: slamcli formats"

@@ -87,14 +87,17 @@ def reduction_of(width: int, height: int) -> int:
 
 
 def _colour_size(source: Images, rows: np.ndarray) -> tuple[int, int] | None:
-    """Find (width, height) of the first colour image that can be read, among a few."""
+    """Find (width, height) of colour: what two images of a few agree on, so that one of another size costs no more than its frame."""
+    sizes: list[tuple[int, int]] = []
     for i in spread(len(rows), PROBED):
         try:
             size = images.picture_size(picture(source, int(rows[i])), source.where(int(rows[i])))
         except BadFrame:
             continue
-        return size
-    return None
+        if size in sizes:
+            return size
+        sizes.append(size)
+    return sizes[0] if sizes else None
 
 
 def _look_at_depth(source: Images, depth_row: np.ndarray) -> _Probe:

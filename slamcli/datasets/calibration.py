@@ -1,5 +1,6 @@
 """Where a recording's intrinsics come from: the user, a file in its folder, a camera's name, or the known cameras of the TUM data set."""
 
+import os
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -46,12 +47,23 @@ def find_calibration(root: Path, files: tuple[str, ...] = ()) -> Calibration:
 
     A camera file that has not all of fx, fy, cx and cy adds to what else is found.
     """
-    for name in CAMERA_FILES:
-        if (root / name).is_file():
-            values, depth, T_cd = read_camera_file(root / name)
-            others = {} if all(key in values for key in NEEDED) else _found(root, files).values
-            return Calibration({**others, **values}, str(root / name), depth, T_cd)
-    return _found(root, files)
+    there = [root / name for name in CAMERA_FILES if os.path.lexists(root / name)]  # a dead link is told of, not passed over
+    if not there:
+        return _found(root, files)
+    values, depth, T_cd = read_camera_file(there[0])
+    others = {} if all(key in values for key in NEEDED) else _found(root, files).values
+    said = tuple(text for other in there[1:] if (text := _disagreement(there[0], values, other)))
+    return Calibration({**others, **values}, str(there[0]), depth, T_cd, said)
+
+
+def _disagreement(path: Path, values: dict[str, Any], other: Path) -> str:
+    """Say what a second camera file has otherwise, "" where nothing or where it cannot be read."""
+    try:
+        second, _, _ = read_camera_file(other)
+    except SlamError:
+        return ""
+    differing = [f"{key} {values[key]} and {second[key]}" for key in values if key in second and values[key] != second[key]]
+    return f"{path} and {other.name} disagree ({', '.join(differing)}): {path.name} counts; delete the wrong one" if differing else ""
 
 
 def _found(root: Path, files: tuple[str, ...]) -> Calibration:

@@ -45,6 +45,10 @@ class Folder:
             found = next((there for home in homes if (there := self._exact(PurePosixPath(home) / posix)) is not None), None)
         return found or str(posix)
 
+    def has(self, name: str) -> bool:
+        """Say whether a listed name is a file that is there, in any spelling that `find` sees through."""
+        return self._exact(PurePosixPath(name.replace("\\", "/"))) is not None
+
     def _tail(self, path: PurePosixPath) -> str | None:
         """Find a path of another place by its end, the longest that exists here."""
         parts = [part for part in path.parts if part != "/" and not part.endswith(":")]

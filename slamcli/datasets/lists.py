@@ -22,6 +22,7 @@ STAMP_FIRST = (
 )
 STAMP_LAST = re.compile(rf"\s*(\S.*?)\s*[,;\s]\s*[\"']?({DECIMAL_COMMA}|{NUMBER})[\"']?\s*$", re.IGNORECASE)
 WHOLE_NUMBER = re.compile(rf"[\"']?({DECIMAL_COMMA}|{NUMBER})[\"']?$", re.IGNORECASE)
+LARGEST_STAMP = 1e19  # [ns] since 1970, in the year 2286; no stamp in any unit is larger
 EARLIEST, NANOSECONDS = 5e8, 1e9  # [s] since 1970 of any recording; in a second
 POSE_COLUMNS = 8  # stamp tx ty tz qx qy qz qw
 
@@ -65,7 +66,9 @@ def read_list(path: Path, folder: Folder | None = None) -> ImageList:
             if number > 1 or any(c.isdigit() for c in line):  # else it is a heading
                 bad_lines.append(number)
             continue
-        entries.append((entry[0], _found(folder, entry[1], path, number, homes)))
+        name = _found(folder, entry[1], path, number, homes)
+        _refuse_more_columns(folder, name, path, number)
+        entries.append((entry[0], name))
     if not entries:
         raise SlamError(f"{path}: lists no image; expected lines 'stamp file'")
     warnings = _unusable(path, bad_lines)
@@ -164,7 +167,7 @@ def _stamp_and_name(line: str) -> tuple[float, str] | None:
         stamp, rest = to_float(found.group(2)), found.group(1)
     name = re.split(r"[\t;]", rest)[0].strip().strip(",").strip("\"'").strip()
     is_name = name and not WHOLE_NUMBER.fullmatch(name)
-    return (stamp, name) if is_name and math.isfinite(stamp) else None
+    return (stamp, name) if is_name and abs(stamp) <= LARGEST_STAMP else None
 
 
 def _number_first(text: str) -> re.Match | None:
@@ -194,7 +197,7 @@ def _pair_row(tokens: list[str]) -> tuple[list[float], list[str], list[float], l
         stamps, pose = [], behind
     else:
         return None
-    if not all(math.isfinite(stamp) for stamp in stamps):
+    if not all(abs(stamp) <= LARGEST_STAMP for stamp in stamps):
         return None
     return stamps, names, pose if len(pose) == POSE_COLUMNS and np.isfinite(pose).all() else [], []
 
@@ -225,6 +228,16 @@ def _found(folder: Folder, name: str, path: Path, number: int, homes: tuple[str,
         return folder.find(name, homes)
     except SlamError as error:
         raise SlamError(f"{path}:{number}: {error}") from None
+
+
+def _refuse_more_columns(folder: Folder, name: str, path: Path, number: int) -> None:
+    """Raise SlamError where a name is no file, but its first word is: a comment or further columns follow it."""
+    first, *rest = re.split(r"[\s,]+", name, maxsplit=1)
+    if rest and not folder.has(name) and folder.has(first):
+        raise SlamError(
+            f"{path}:{number}: {rest[0]!r} follows the file name {first}; a line has a stamp and a file, a comment a line of its own; "
+            "a list of pairs is called associations.txt"
+        )
 
 
 def _unusable(path: Path, bad_lines: list[int]) -> list[str]:

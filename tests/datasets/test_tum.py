@@ -1,5 +1,6 @@
 """The TUM reader: association as the data set's own script does it, and every kind of broken recording."""
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -128,6 +129,74 @@ def test_recordings_that_make_no_sense_are_refused(tmp_path: Path, files: dict[s
     assert str(folder) in str(caught.value) and "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [(" # blurred", "'# blurred' follows the file name rgb/0.png"), (" 0.004 depth/0.png", "associations.txt"), (",7", "'7' follows")],
+)
+def test_what_follows_a_file_name_is_told_with_its_line(tmp_path: Path, more: str, said: str) -> None:
+    folder = write_recording(tmp_path / "r")
+    path = folder / "rgb.txt"
+    path.write_text(path.read_text().replace("rgb/0.png", f"rgb/0.png{more}"))
+    with pytest.raises(SlamError, match=rf"rgb\.txt:2: .*{said}"):
+        open_dataset(str(folder))
+
+
+def test_a_name_with_a_blank_or_a_comma_is_a_name(tmp_path: Path) -> None:
+    folder = write_recording(tmp_path / "r")
+    (folder / "rgb" / "0.png").rename(folder / "rgb" / "a, b.png")
+    path = folder / "rgb.txt"
+    path.write_text(path.read_text().replace("rgb/0.png", "rgb/a, b.png"))
+    assert open_dataset(str(folder)).colour_name[0] == "rgb/a, b.png"
+
+
+@pytest.mark.parametrize("stamp", ["1e300", "-2e19"])
+def test_a_stamp_beyond_all_clocks_costs_its_line(tmp_path: Path, stamp: str) -> None:
+    folder = write_recording(tmp_path / "r")
+    path = folder / "rgb.txt"
+    path.write_text(path.read_text().replace("0.033333", stamp))
+    dataset = open_dataset(str(folder))
+    assert len(dataset) == 3 and dataset.warnings == [f"{path}: 1 unusable lines left out, the first is line 3"]
+
+
+@pytest.mark.parametrize("odd", [0, 3])
+def test_an_image_of_another_size_costs_its_frame_wherever_it_is(tmp_path: Path, odd: int) -> None:
+    folder = write_recording(tmp_path / "r")
+    (folder / "rgb" / f"{odd}.png").write_bytes(png(colour(odd)[:24, :32].copy()))
+    dataset = open_dataset(str(folder))
+    assert (dataset.camera.width, dataset.camera.height) == (64, 48)
+    for i in range(4):
+        if i == odd:
+            with pytest.raises(BadFrame, match="is 32 x 24 px, the others are 64 x 48"):
+                dataset.grey(i)
+        else:
+            assert dataset.grey(i).shape == (48, 64)
+
+
+def test_camera_files_that_disagree_are_told_of(tmp_path: Path) -> None:
+    folder = write_recording(tmp_path / "r")
+    same = "width = 64\nheight = 48\nfx = 60.0\nfy = 60.0\ncx = 31.5\ncy = 23.5\ndepth_scale = 5000\n"
+    (folder / "camera.toml").write_text(same)
+    assert open_dataset(str(folder)).warnings == []
+    (folder / "camera.toml").write_text(same.replace("fx = 60.0", "fx = 45.0"))
+    dataset = open_dataset(str(folder))
+    assert dataset.camera.fx == 45.0
+    assert [text for text in dataset.warnings if "camera.json disagree (fx 45.0 and 60.0): camera.toml counts" in text]
+
+
+@pytest.mark.parametrize("name", ["rgb.txt", "camera.json", "camera.toml"])
+def test_a_dead_link_or_a_pipe_in_the_place_of_a_file_is_named(tmp_path: Path, name: str) -> None:
+    folder = write_recording(tmp_path / "r")
+    path = folder / name
+    path.unlink(missing_ok=True)
+    path.symlink_to("nowhere")
+    with pytest.raises(SlamError, match=f"{name}: cannot be read"):
+        open_dataset(str(folder))
+    path.unlink()
+    os.mkfifo(path)
+    with pytest.raises(SlamError, match=f"{name}: not a regular file"):
+        open_dataset(str(folder))
+
+
 def test_missing_lists(tmp_path: Path) -> None:
     folder = write_recording(tmp_path / "r")
     (folder / "depth.txt").unlink()
@@ -136,6 +205,8 @@ def test_missing_lists(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     with pytest.raises(SlamError, match="not a recording"):
         open_dataset(str(tmp_path / "empty"))
+    with pytest.raises(SlamError, match="/dev/zero: a device or a pipe"):
+        open_dataset("/dev/zero")
 
 
 @pytest.mark.parametrize("content", [b"", b"\x89PNG\r\n\x1a\n", None])

@@ -1,5 +1,6 @@
 """TUM RGB-D, ETH3D-SLAM and Bonn: a folder with rgb.txt, depth.txt and, where known, groundtruth.txt."""
 
+import os
 from pathlib import Path
 
 from slamcli.datasets.calibration import find_calibration
@@ -13,8 +14,8 @@ DEPTH_SCALE = 5000.0  # of the TUM data set and of ETH3D, where a calibration is
 
 
 def recognises(path: Path) -> bool:
-    """Look for the list of colour images."""
-    return (path / "rgb.txt").is_file()
+    """Look for the list of colour images; one that cannot be read, as a dead link, is told of then."""
+    return os.path.lexists(path / "rgb.txt")
 
 
 def read(path: Path) -> Recorded:
