@@ -101,7 +101,9 @@ class LoopCloser:
         contradicted = Claims((c for c in fates if not c.is_accepted and c.T_ij is not None), span=span)
         accepted = []
         for candidate in self._progress(candidates, "loop"):
-            if closed.cover(candidate) or (not candidate.is_by_pose and contradicted.cover(candidate)):
+            if closed.cover(candidate) or (
+                not candidate.is_by_pose and (contradicted.cover(candidate) or self._matches_too_little(candidate))
+            ):
                 continue
             verified = self._verified(candidate)
             if verified.is_accepted and (reason := self._doubt(verified)):
@@ -111,6 +113,11 @@ class LoopCloser:
                 accepted.append(verified)
                 closed.add(verified)
         return accepted
+
+    def _matches_too_little(self, candidate: Candidate) -> bool:
+        """Say whether a pair that its words propose was tried before and had too few matches: these do not depend on the map."""
+        before = self.fate.get((candidate.kf_i, candidate.kf_j))
+        return before is not None and not before.is_by_pose and before.n_matches < self._settings.min_matches
 
     def _correct(self, closures: list[Candidate]) -> list[Candidate]:
         """Solve the pose graph with new closures and move the map; returns those that the rest of the graph does not contradict."""

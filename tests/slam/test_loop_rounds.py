@@ -1,6 +1,7 @@
 """What becomes of loop candidates, verified by a test's own word: which are tried, which join segments, which are dropped, what is fused."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -46,6 +47,7 @@ class Rounds:
         refused: tuple[Pair, ...] = (),
         segment: list[int] | None = None,
         n_inliers: dict[Pair, int] | None = None,
+        matches_of_refused: int = 100,
         objection: Callable[[Join], str] = loop_closing.no_objection,
         is_stiff: bool = True,
         **settings,
@@ -58,7 +60,7 @@ class Rounds:
         def verify(sparse_map, words, c, *_) -> Candidate:
             self.tried.append((c.kf_i, c.kf_j))
             if self.tried[-1] in refused:
-                return c.rejected("refused")
+                return replace(c, n_matches=matches_of_refused).rejected("refused")
             T_ij = se3.inverse(self.truth[c.kf_i]) @ self.truth[c.kf_j] @ (AWAY if self.tried[-1] in false else np.eye(4))
             return Candidate(c.kf_i, c.kf_j, c.score, 100, (n_inliers or {}).get(self.tried[-1], 100), T_ij=T_ij, is_by_pose=c.is_by_pose)
 
@@ -97,6 +99,13 @@ def test_what_the_graph_contradicts_is_dropped_and_words_do_not_name_it_again(mo
     fate = rounds.fate()
     assert fate[59, 0] == "" and "contradicts it (chi2 " in fate[30, 5] and fate[32, 5] == ""
     assert np.abs(rounds.map.kf.T_wk - rounds.truth).max() < 0.02
+
+
+@pytest.mark.parametrize(("n_matches", "times"), [(19, 1), (20, 2)])
+def test_what_had_too_few_matches_is_not_asked_again_and_what_the_map_may_have_changed_is(monkeypatch, n_matches: int, times: int):
+    rounds = Rounds(monkeypatch, alike=[(59, 0), (30, 5)], refused=((30, 5),), matches_of_refused=n_matches, min_matches=20, rounds=3)
+    rounds.closer.close_loops()
+    assert rounds.tried.count((30, 5)) == times and rounds.fate()[30, 5] == "refused"
 
 
 def test_where_the_graph_contradicts_all_the_map_stays_and_no_further_round_is_made(monkeypatch):
