@@ -41,6 +41,8 @@ from slamcli.cli.common import Target
 @click.option("--dark", is_flag=True, help="No lamp: the colour images hold noise only, the depth camera has its own light.")
 @click.option("--moved-object", "movable", is_flag=True, help="A parcel is taken away half-way.")
 @click.option("--gone-from", default=0.5, show_default=True, help="Share of the frames after which it is gone; 0 = it never was there.")
+@click.option("--door", is_flag=True, help="A door swings open while the camera looks at it.")
+@click.option("--moved-chair", is_flag=True, help="A chair stands elsewhere when it is seen again.")
 @click.option("--people", type=click.IntRange(0, 20), default=0, show_default=True, help="How many figures walk about in view.")
 @click.option(
     "--activity",
@@ -69,7 +71,8 @@ def simulate(
     second drives it backwards, the light is another, and stamps begin at 0 in each; truth is told in one frame.
 
     OUT has the TUM layout: colour and depth images, groundtruth.txt (exact), camera.json, and scene.json with every obstacle. With people,
-    moving/ says which pixels of the colour images show one, scene.json how large a share. The same settings give the same recording.
+    a door or a chair that moves, moving/ says which pixels of the colour images show one, scene.json how large a share. The same settings
+    give the same recording.
 
     \b
       slamcli simulate room --seed 3

@@ -9,9 +9,10 @@ import cv2
 import numpy as np
 
 from slamcli.datasets.lists import read_text
-from slamcli.datasets.simulated import building, drive, noise, people, room
+from slamcli.datasets.simulated import building, drive, moved_things, noise, people, room
 from slamcli.datasets.simulated.drive import Motion
 from slamcli.datasets.simulated.figures import Figure
+from slamcli.datasets.simulated.moved_things import Moved
 from slamcli.datasets.simulated.noise import SensorNoise
 from slamcli.datasets.simulated.scene import Patch, Scene, with_textured_share
 from slamcli.datasets.staging import staged
@@ -63,6 +64,8 @@ class Simulation:
     dark: bool = False  # nothing but noise in the colour images; depth brings its own light
     movable: bool = False  # a parcel that is taken away,
     gone_from: float = 0.5  # after this share of the frames; 1 = never
+    door: bool = False  # a door opens while the camera looks at it
+    moved_chair: bool = False  # a chair stands elsewhere from a moment on in which it is out of view
     people: int = 0  # who walk about in view of the camera
     activities: tuple[str, ...] = ()  # that they take up in turn; () = all there are
     start: float = 0.0  # share of the round at which the drive begins
@@ -98,14 +101,28 @@ def simulate(out: Path, *, progress: Progress, workers: int = 2, **settings: obj
         motion, scene.low, scene.high, people=what.people, activities=what.activities or tuple(people.ACTIVITIES),
         drives=what.trajectory is None, seed=what.seed,
     )  # fmt: skip
+    moved = _moved_things(what, scene, motion)
+    figures += [one.figure for one in moved]
     with staged(out) as staging, least_instructions_in_opencv():
         (staging / "rgb").mkdir()
         (staging / "depth").mkdir()
         if figures:
             (staging / "moving").mkdir()
         shares = _write_images(staging, what, scene, motion, figures, progress, workers)
-        _write_lists(staging, what, scene, motion, figures, shares)
+        last = [solid for one in moved for solid in one.last]
+        _write_lists(staging, what, replace(scene, solids=[*scene.solids, *last]), motion, figures, shares)
     return out
+
+
+def _moved_things(what: Simulation, scene: Scene, motion: Motion) -> list[Moved]:
+    """Make the door and the chair, as far as they are asked for."""
+    found = []
+    if what.door:
+        doorway = max(scene.doorways, key=lambda one: moved_things.seconds_in_view(one, motion))
+        found.append(moved_things.door(doorway, motion, np.random.default_rng([what.seed, 8])))
+    if what.moved_chair:
+        found.append(moved_things.chair(scene.chair_places, motion))
+    return found
 
 
 def simulate_several(out: Path, recordings: int, *, progress: Progress, workers: int = 2, **settings: object) -> list[Path]:
@@ -151,8 +168,9 @@ def build(what: Simulation) -> tuple[Scene, Motion]:
         return room.corridor(low, high, seed=what.seed, twin=what.twin), motion
     centres = np.column_stack([path, np.zeros(len(path))])  # the robot itself is on the floor
     return room.furnished_room(
-        low, high, centres, seed=what.seed, twin=what.twin, twins=what.alias == "posters", movable=what.movable, empty=what.empty
-    ), motion
+        low, high, centres, seed=what.seed, twin=what.twin, twins=what.alias == "posters", movable=what.movable, empty=what.empty,
+        moved_chair=what.moved_chair,
+    ), motion  # fmt: skip
 
 
 def _drive(what: Simulation, path: np.ndarray, rng: np.random.Generator, **more: float) -> Motion:
@@ -178,8 +196,9 @@ def _around_trajectory(what: Simulation, trajectory: Path) -> tuple[Scene, Motio
         low[axis], high[axis] = low[axis] - lacking, high[axis] + lacking
     low[2], high[2] = 0.0, max(room.HEIGHT, float(centres[:, 2].max()) + 0.5)
     return room.furnished_room(
-        low, high, centres, seed=what.seed, twins=what.alias == "posters", movable=what.movable, empty=what.empty
-    ), motion
+        low, high, centres, seed=what.seed, twins=what.alias == "posters", movable=what.movable, empty=what.empty,
+        moved_chair=what.moved_chair,
+    ), motion  # fmt: skip
 
 
 def read_stamps(path: Path) -> np.ndarray:
@@ -212,6 +231,8 @@ def _check(what: Simulation) -> None:
         raise SlamError(f"activities: {unknown[0]!r} is unknown; known are {', '.join(people.ACTIVITIES)}")
     if what.building and (what.people or what.movable or what.alias or what.trajectory is not None):
         raise SlamError("building: takes no people, moved object, alias or trajectory")
+    if (what.door or what.moved_chair) and (what.building or what.alias == "corridor"):
+        raise SlamError("door, moved_chair: only in a room, not in a building or a corridor")
     if what.depth_min >= what.depth_max:
         raise SlamError(f"depth_min = {what.depth_min}, depth_max = {what.depth_max}: the first must be smaller")
     if min(what.room) < SIDES[0] or max(what.room) > SIDES[1]:

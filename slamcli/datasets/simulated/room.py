@@ -9,7 +9,7 @@ from slamcli.datasets.simulated import picture as p
 from slamcli.datasets.simulated import texture as t
 from slamcli.datasets.simulated.brush import Painter, pick
 from slamcli.datasets.simulated.furniture import Piece
-from slamcli.datasets.simulated.scene import Scene, Solid, box, cylinder, room_shell
+from slamcli.datasets.simulated.scene import Doorway, Scene, Solid, box, cylinder, room_shell
 from slamcli.errors import SlamError
 
 HEIGHT = 2.6  # [m] of the ceiling
@@ -18,6 +18,8 @@ LOW_BOX = np.array([0.5, 0.3, 0.12])
 HANGING_BOX = np.array([0.5, 0.35, 0.3])
 HANGING_AT = 0.3  # [m] above the floor: a planar laser at robot height looks underneath
 CORRIDOR_PITCH = 2.0  # [m] from door to door
+CHAIR_PLACES, CHAIR_TO_PATH = 12, 1.2  # that are looked for; [m] to the camera's path at most
+DOOR, BEFORE_DOOR = (0.95, 2.1), 0.5  # [m] width and height; floor that stays free before it
 WALL_COLOURS = ((236, 226, 205), (204, 220, 224), (228, 206, 190), (214, 222, 196), (226, 218, 232))
 
 # Walls by name: start (as seen from inside, left end), direction to the right, turn of furniture standing at them [rad]
@@ -39,6 +41,7 @@ def furnished_room(
     twins: bool = False,
     movable: bool = False,
     empty: bool = False,
+    moved_chair: bool = False,
 ) -> Scene:
     """Furnish a room so that the camera's path never comes near an object.
 
@@ -48,24 +51,26 @@ def furnished_room(
     twins : opposite walls look the same
     movable : put a large parcel beside the path, marked as movable
     empty : put nothing into it
+    moved_chair : find places for a chair beside the path
     """
     rng = np.random.default_rng([seed, 0, *([twin] if twin else [])])
     free = FreeSpace(low, high, path)
-    walls, doors = _paint_walls(low, high, rng, twins)
-    for rect in doors:
-        free.take(rect)
+    walls, doorways = _paint_walls(low, high, rng, twins)
+    for doorway in doorways:
+        free.take(_floor_before(doorway))
     solids: list[Solid] = []
     if not empty:
         _special_boxes(solids, free, rng, high[2], movable)
         _island(solids, free, rng)
         along_walls(solids, free, rng)
         _scatter(solids, free, rng)
+    chair_places = _places_of_a_chair(free, np.random.default_rng([seed, 7])) if moved_chair else ()
     lamps = _lamps(low, high)
     base = pick(rng, (t.planks((196, 150, 100)), t.planks((150, 106, 72)), t.tiles((206, 198, 184)), t.planks((214, 186, 146))))
     floor = p.floor(base, _rugs(low, high, rng))
     lamp_places = tuple((float(x - low[0]), float(y - low[1])) for x, y, _ in lamps)
     shell = room_shell(low, high, walls, floor, p.ceiling(lamp_places), twins=("north", "west") if twins else ())
-    return Scene(low, high, solids, shell, lamps, seed)
+    return Scene(low, high, solids, shell, lamps, seed, tuple(doorways), chair_places)
 
 
 def corridor(low: np.ndarray, high: np.ndarray, *, seed: int, twin: int = 0) -> Scene:
@@ -139,29 +144,33 @@ def _rugs(low: np.ndarray, high: np.ndarray, rng: np.random.Generator) -> tuple[
     return tuple(rugs)
 
 
-def _paint_walls(
-    low: np.ndarray, high: np.ndarray, rng: np.random.Generator, twins: bool
-) -> tuple[dict[str, Painter], list[tuple[np.ndarray, np.ndarray]]]:
-    """Return the walls' painters, and the floor before doors, which stays free."""
+def _paint_walls(low: np.ndarray, high: np.ndarray, rng: np.random.Generator, twins: bool) -> tuple[dict[str, Painter], list[Doorway]]:
+    """Return the walls' painters, and the doors in them."""
     bases = [t.brick((182, 98, 78)), t.stripes(((222, 214, 196), (206, 196, 174), (150, 128, 110)), 0.3)]
     bases += [t.plaster(pick(rng, WALL_COLOURS)) for _ in range(2)]
     order = rng.permutation(4)
-    walls, doors = {}, []
+    walls, doorways = {}, []
     for number, (name, (start, right, _)) in enumerate(WALL_FRAMES.items()):
         length = float(abs((high - low)[:2] @ right))
         has_door = name in ("south", "east")
         door_at = rng.uniform(0.3, 0.6) * length
         items: list = []
         if has_door:
-            items.append((door_at, high[2] - 2.1, 0.95, 2.1, p.door(pick(rng, furniture.WOODS))))
-            a = low[:2] + start * (high - low)[:2] + right * door_at
-            b = a + right * 0.95 + np.array([-right[1], right[0]]) * -0.5
-            doors.append((np.minimum(a, b), np.maximum(a, b)))
-        items += wall_items(length, high[2], rng, [(door_at, door_at + 0.95)] if has_door else [])
+            width, height = DOOR
+            items.append((door_at, high[2] - height, width, height, p.door(pick(rng, furniture.WOODS))))
+            doorways.append(Doorway(low[:2] + start * (high - low)[:2] + right * door_at, right, width, height))
+        items += wall_items(length, high[2], rng, [(door_at, door_at + DOOR[0])] if has_door else [])
         walls[name] = p.wall(bases[order[number]], tuple(items))
     if twins:
         walls["north"], walls["west"] = walls["south"], walls["east"]
-    return walls, doors
+    return walls, doorways
+
+
+def _floor_before(doorway: Doorway) -> tuple[np.ndarray, np.ndarray]:
+    """Return the floor before a door, which stays free."""
+    inward = np.array([doorway.along[1], -doorway.along[0]])
+    a, b = doorway.left, doorway.left + doorway.along * doorway.width + inward * BEFORE_DOOR
+    return np.minimum(a, b), np.maximum(a, b)
 
 
 def wall_items(length: float, height: float, rng: np.random.Generator, taken: list[tuple[float, float]]) -> tuple:
@@ -252,6 +261,19 @@ def _special_boxes(solids: list[Solid], free: FreeSpace, rng: np.random.Generato
         # A low box lies where the robot would drive over it, a hanging one where it would drive under it: beside the path, never on it.
         if not any(_place_freely(piece, solids, free, rng, clearance=0.3, most=most, gap=0.35) for most in (0.8, 1.5, np.inf)):
             raise SlamError(f"simulated room: no place for the {piece.name} beside this path; try another seed or a larger room")
+
+
+def _places_of_a_chair(free: FreeSpace, rng: np.random.Generator) -> tuple[list[Solid], ...]:
+    """Find places for a chair beside the path, apart from each other; SlamError where there is one at most."""
+    piece = furniture.chair("chair_moved", rng)
+    places = list[list[Solid]]()
+    for _ in range(CHAIR_PLACES):
+        solids = list[Solid]()
+        if _place_freely(piece, solids, free, rng, most=CHAIR_TO_PATH, gap=0.1):
+            places.append(solids)
+    if len(places) < 2:
+        raise SlamError("simulated room: no two places for a chair beside this path; try another seed or a larger room")
+    return tuple(places)
 
 
 def _island(solids: list[Solid], free: FreeSpace, rng: np.random.Generator) -> None:

@@ -97,6 +97,16 @@ class Solid:
 
 
 @dataclass(frozen=True)
+class Doorway:
+    """A door in a wall, as seen from inside the room."""
+
+    left: np.ndarray  # (2,) [m] its left end on the wall
+    along: np.ndarray  # (2,) unit, to its right end
+    width: float  # [m]
+    height: float  # [m]
+
+
+@dataclass(frozen=True)
 class Scene:
     """A furnished room."""
 
@@ -106,6 +116,8 @@ class Scene:
     shell: list[Patch]  # floor, walls, ceiling
     lamps: np.ndarray  # (n, 3) [m] centres of the square ceiling lamps
     seed: int
+    doorways: tuple[Doorway, ...] = ()
+    chair_places: tuple[list[Solid], ...] = ()  # where a chair that is moved may stand, its parts in each; it is none of the solids
 
     def patches(self) -> list[Patch]:
         """Return every patch, the room's own first."""
