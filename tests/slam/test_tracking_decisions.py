@@ -11,7 +11,7 @@ from slamcli.geometry import se3
 from slamcli.schema import KEY_FRAME, LOST, ON_DEPTH, RELOCALIZED, TRACKED, Rests, frame_poses, frame_segments
 from slamcli.slam import background_prior
 from slamcli.slam.depth_localization import DepthMatch
-from slamcli.slam.localizer import nothing_seen
+from slamcli.slam.localizer import KnownMap, Localizer, nothing_seen
 from slamcli.slam.recording import NOTHING_KNOWN, KnownMotion
 from slamcli.slam.tracker import Tracker
 
@@ -139,6 +139,14 @@ def test_a_dark_frame_could_not_be_recognized_and_does_not_count():
     assert all(reason == "0 features: blank or unreadable image" for reason in tracker.lost_reason.values())
 
 
+def test_only_before_there_is_a_map_is_a_frame_told_that_there_is_none():
+    scene, _ = lost_and_back(("here", 8), ("there", 4))
+    scene.features.depth[scene.features.offset[8] :] = np.nan  # nothing to begin another segment with
+    tracker = track(scene, segment_after=2)
+    assert tracker.tracks().state[8:].tolist() == [LOST] * 4 and tracker.map().kf_segment.max() == 0
+    assert all("agree with the map" in tracker.lost_reason[i] for i in range(8, 12))
+
+
 def test_what_agrees_with_too_little_of_the_map_is_told_so():
     scene, _ = lost_and_back(("here", 5), ("there", 1))
     n = len(scene.frames(SENSOR)[5])
@@ -154,6 +162,28 @@ def test_after_a_frame_of_which_no_landmark_is_known_those_of_its_reference_are_
     tracker.process(6)
     tracks = tracker.tracks()
     assert tracks.state[6] != LOST and tracks.n_inliers[6] > 0.5 * tracks.n_inliers[5]
+
+
+def test_what_was_seen_but_is_no_landmark_is_lifted_by_depth_where_the_frame_before_stood():
+    T_gc, step = sweep(8, length=0.1), se3.exp(np.array([0, 0, 0, 0, 0.1, 0]))  # 50 px, so that another place of it would be told
+    T_gc[5:] = T_gc[5:] @ step
+    T_gc[6:] = T_gc[6:] @ step
+    tracker = track(seen(T_gc), until=6, relocalize_inliers=NO_CROWD, key_frame_share=0.0)
+    tracker._previous.remember(tracker._previous.features, nothing_seen(tracker._previous.features))
+    tracker.process(6)
+    tracks = tracker.tracks()
+    assert tracks.state[6] == TRACKED and tracks.n_inliers[6] > 0.5 * tracks.n_inliers[5]
+
+
+def test_once_a_recording_is_recognized_in_a_map_its_frames_are_followed_there():
+    scene = seen(sweep(10), blind=(5,))
+    tracker = track(scene)
+    localizer = Localizer(KnownMap(tracker._sparse_map, tracker._places), scene.recording(SENSOR), TrackConfig(), np.random.default_rng(0))
+    for i in range(10):
+        localizer.process(i)
+        n_remembered = np.count_nonzero(localizer.previous.landmark >= 0)
+        assert n_remembered >= localizer.tracks().n_inliers[i] and (n_remembered > 50) == (i != 5), "the next frame is tracked by these"
+    assert localizer.tracks().state.tolist() == [RELOCALIZED, *[TRACKED] * 4, LOST, RELOCALIZED, *[TRACKED] * 3]
 
 
 def drifting(T_gc: np.ndarray) -> np.ndarray:
