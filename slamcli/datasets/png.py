@@ -117,11 +117,21 @@ def _parts(data: bytes, size: tuple[int, int], kind: tuple[int, int]) -> list[me
 
 
 @kernel
+def _nearest(left, up, corner):
+    """Return that of the three neighbours of a byte which is nearest to left + up - corner; the first of equal ones."""
+    to_left, to_up = up - corner, left - corner
+    to_left, to_up, to_corner = abs(to_left), abs(to_up), abs(to_left + to_up)
+    nearest = up if to_up <= to_corner else corner
+    return left if (to_left <= to_up) & (to_left <= to_corner) else nearest
+
+
+@kernel
 def _unfilter(rows: _Bytes, step: u8, above: u1[::1], image: u1[:, ::1]):
     """Undo the filter of each row; returns False where a row names a filter that does not exist.
 
     rows : (H (1 + N),) uint8, the filter before each row; step : bytes of a pixel, 2 or 3; above : (N,) uint8, 0; image : (H, N) uint8, filled
-    Bytes are sums modulo 256. SUB, what OpenCV and the TUM recordings use, keeps the pixel to the left in registers.
+    Bytes are sums modulo 256. SUB, what OpenCV uses, and PAETH, most of the TUM recordings' depth, keep the pixel to the left in registers:
+    each waits for the one before, and to read it back from memory would take longer than all else.
     """
     n = uintp(image.shape[1])
     at = uintp(1)
@@ -149,14 +159,22 @@ def _unfilter(rows: _Bytes, step: u8, above: u1[::1], image: u1[:, ::1]):
             for k in range(step, n):
                 row[k] = uint8(rows[at + k] + ((uint16(row[k - step]) + uint16(above[k])) >> 1))
         elif kind == PAETH:
-            for k in range(step):
-                row[k] = uint8(rows[at + k] + above[k])
-            for k in range(step, n):
-                left, up, corner = int32(row[k - step]), int32(above[k]), int32(above[k - step])
-                to_left, to_up, to_corner = abs(up - corner), abs(left - corner), abs(left + up - corner - corner)
-                nearest = up if to_up <= to_corner else corner
-                nearest = left if (to_left <= to_up) & (to_left <= to_corner) else nearest
-                row[k] = uint8(rows[at + k] + nearest)
+            a = b = c = upper_a = upper_b = upper_c = int32(0)
+            if step == TWO:
+                for k in range(ZERO, n, TWO):
+                    here_a, here_b = int32(above[k]), int32(above[k + ONE])
+                    a = (int32(rows[at + k]) + _nearest(a, here_a, upper_a)) & int32(255)
+                    b = (int32(rows[at + k + ONE]) + _nearest(b, here_b, upper_b)) & int32(255)
+                    row[k], row[k + ONE] = uint8(a), uint8(b)
+                    upper_a, upper_b = here_a, here_b
+            else:
+                for k in range(ZERO, n, THREE):
+                    here_a, here_b, here_c = int32(above[k]), int32(above[k + ONE]), int32(above[k + TWO])
+                    a = (int32(rows[at + k]) + _nearest(a, here_a, upper_a)) & int32(255)
+                    b = (int32(rows[at + k + ONE]) + _nearest(b, here_b, upper_b)) & int32(255)
+                    c = (int32(rows[at + k + TWO]) + _nearest(c, here_c, upper_c)) & int32(255)
+                    row[k], row[k + ONE], row[k + TWO] = uint8(a), uint8(b), uint8(c)
+                    upper_a, upper_b, upper_c = here_a, here_b, here_c
         else:
             return False
         above = row
