@@ -6,6 +6,8 @@ from collections.abc import Callable, Iterable
 import numpy as np
 
 from slamcli.config.options import LoopConfig
+from slamcli.geometry import se3
+from slamcli.geometry.algebra import product
 from slamcli.schema import Words
 from slamcli.slam import loop_pose_graph, map_merging
 from slamcli.slam.loop_candidates import Candidate, Claims, find_alike, find_by_pose, first_of_each_revisit
@@ -17,6 +19,8 @@ from slamcli.sparse_map.frame import FrameStore
 from slamcli.sparse_map.landmark_fusion import fuse_landmarks
 from slamcli.sparse_map.sparse_map import SparseMap
 
+MOVED_M, MOVED_RAD = 0.005, 0.003  # a pixel or two: verification looks for landmarks in windows of sixteen
+
 
 def no_objection(found: Join) -> str:
     """Object to no join: parts of one recording are joined when several closures agree."""
@@ -26,6 +30,12 @@ def no_objection(found: Join) -> str:
 def no_doubt(closure: Candidate) -> str:
     """Object to no closure."""
     return ""
+
+
+def has_moved(before: np.ndarray, after: np.ndarray) -> bool:
+    """Say whether any key frame, of poses (K, 4, 4), moved so far that candidates would be proposed or verified otherwise."""
+    motion = se3.log(product(se3.inverse(before), after))
+    return bool((np.linalg.norm(motion[:, :3], axis=1) > MOVED_M).any() or (np.linalg.norm(motion[:, 3:], axis=1) > MOVED_RAD).any())
 
 
 class LoopCloser:
@@ -57,11 +67,14 @@ class LoopCloser:
         """Join segments, then search, verify and correct while that brings new closures. Returns all candidates with their fate."""
         self.join_segments()
         for _ in range(self._settings.rounds):
-            closures = self._verify(self._propose())
+            closures, T_wk = self._verify(self._propose()), self._sparse_map.kf.T_wk.copy()
             kept = self._correct(closures) if closures else []
             if not kept:
                 break
-            self._fuse_and_adjust(kept)
+            is_last = len(kept) == len(closures) and not has_moved(T_wk, self._sparse_map.kf.T_wk)
+            self._fuse_and_adjust(kept, is_last=is_last)
+            if is_last:
+                break
         return [self.fate[pair] for pair in sorted(self.fate)]
 
     def join_segments(self) -> None:
@@ -129,12 +142,14 @@ class LoopCloser:
             loop_pose_graph.move(self._sparse_map, graph.T_wk)
         return list(itertools.compress(closures, is_kept))
 
-    def _fuse_and_adjust(self, closures: list[Candidate]) -> None:
-        """Fuse what both sides of the closures see, and adjust the whole map, to its optimum unless the final refinement does that."""
+    def _fuse_and_adjust(self, closures: list[Candidate], *, is_last: bool = False) -> None:
+        """Fuse what both sides of the closures see, and adjust the whole map; where the final refinement follows, roughly, at last not at all."""
         sparse_map = self._sparse_map
         for closure in closures:
             self._fuse_around(closure)
         sparse_map.refresh(np.flatnonzero(sparse_map.lm.is_alive).astype(np.int32))
+        if is_last and self._settings.final_refinement:
+            return
         kfs, most = np.arange(len(sparse_map.kf), dtype=np.int32), self._settings.iterations
         tolerance = map_adjustment.NEARLY if self._settings.final_refinement else map_adjustment.CONVERGED
         map_adjustment.adjust(sparse_map, kfs, self._frames.camera, self._frames.sensor, max_iterations=most, tolerance=tolerance)

@@ -103,9 +103,20 @@ def test_what_the_graph_contradicts_is_dropped_and_words_do_not_name_it_again(mo
 
 @pytest.mark.parametrize(("n_matches", "times"), [(19, 1), (20, 2)])
 def test_what_had_too_few_matches_is_not_asked_again_and_what_the_map_may_have_changed_is(monkeypatch, n_matches: int, times: int):
-    rounds = Rounds(monkeypatch, alike=[(59, 0), (30, 5)], refused=((30, 5),), matches_of_refused=n_matches, min_matches=20, rounds=3)
+    alike, false = [(59, 0), (30, 5), (45, 20)], ((45, 20),)  # what the graph contradicts asks for a second round
+    rounds = Rounds(monkeypatch, alike=alike, false=false, refused=((30, 5),), matches_of_refused=n_matches, min_matches=20, rounds=3)
     rounds.closer.close_loops()
     assert rounds.tried.count((30, 5)) == times and rounds.fate()[30, 5] == "refused"
+
+
+@pytest.mark.parametrize(("is_refined", "shift", "n_rounds", "n_adjusted"), [(True, 0.0, 1, 0), (False, 0.0, 1, 1), (True, 0.02, 2, 1)])
+def test_rounds_end_where_closures_move_nothing(monkeypatch, is_refined: bool, shift: float, n_rounds: int, n_adjusted: int):
+    rounds, adjusted = Rounds(monkeypatch, alike=[(59, 0), (30, 5)], refused=((30, 5),), rounds=3, final_refinement=is_refined), []
+    monkeypatch.setattr(map_adjustment, "adjust", lambda *_, **how: adjusted.append(how))
+    rounds.truth[59, 0, 3] += shift  # where the closure says that it is
+    rounds.closer.close_loops()
+    assert rounds.tried.count((30, 5)) == n_rounds and len(adjusted) == n_adjusted
+    assert {kf for kf, _ in rounds.fused} >= {59, 0}
 
 
 def test_where_the_graph_contradicts_all_the_map_stays_and_no_further_round_is_made(monkeypatch):
@@ -193,13 +204,15 @@ def test_each_side_of_a_closure_is_looked_for_on_the_other(monkeypatch, most: in
 
 def test_what_was_refused_is_tried_again_on_the_corrected_map(monkeypatch):
     rounds = Rounds(monkeypatch, alike=[(50, 2), (30, 20)], refused=((50, 2),), rounds=2)
+    rounds.truth[30, 0, 3] += 0.02  # where the closure says that it is
     rounds.closer.close_loops()
     assert rounds.tried == [(50, 2), (30, 20), (50, 2)]
 
 
 @pytest.mark.parametrize(("is_refined", "tolerance"), [(True, map_adjustment.NEARLY), (False, map_adjustment.CONVERGED)])
 def test_the_map_comes_to_its_optimum_once(monkeypatch, is_refined, tolerance):
-    rounds, given = Rounds(monkeypatch, alike=[(50, 2)], final_refinement=is_refined), []
+    rounds, given = Rounds(monkeypatch, alike=[(59, 0)], final_refinement=is_refined), []
     monkeypatch.setattr(map_adjustment, "adjust", lambda *_, **how: given.append(how["tolerance"]))
+    rounds.truth[59, 0, 3] += 0.02  # where the closure says that it is
     rounds.closer.close_loops()
     assert given == [tolerance]
