@@ -9,8 +9,11 @@ import os
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from io import TextIOWrapper
 from pathlib import Path
 from typing import Any, TypeVar
+
+from slamcli import files
 
 Item = TypeVar("Item")
 Progress = Callable[..., Iterable[Any]]  # (items, label, total=None) -> the same items, one by one
@@ -46,6 +49,10 @@ class _StderrHandler(logging.Handler):
 
 class _LogFile(logging.FileHandler):
     """The run's log. A disk that is full stops the run where it writes results, and says so there."""
+
+    def _open(self) -> TextIOWrapper:
+        """Follow no link, and wait for no pipe."""
+        return files.open_own(self.baseFilename)
 
     def handleError(self, record: logging.LogRecord) -> None:
         """Go on without this line."""

@@ -15,7 +15,7 @@ import tempfile
 import tomllib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from io import BufferedReader
+from io import BufferedReader, TextIOWrapper
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -208,6 +208,23 @@ def open_regular(path: str | Path) -> BufferedReader:
         os.close(descriptor)
         raise SlamError(f"{path}: not a regular file; a device or a pipe cannot be read here")
     return file
+
+
+def open_own(path: str | Path) -> TextIOWrapper:
+    """Open a text file of a run for reading and appending, making it where it is not there.
+
+    SlamError where a link, a device or a pipe has its place: who sent the run would have another file changed, or us wait.
+    """
+    try:
+        descriptor = os.open(path, os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC, 0o666)
+    except OSError as error:
+        if error.errno != errno.ELOOP:
+            raise
+        raise SlamError(f"{path}: a link has the place of a run's own file; remove it") from error
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise SlamError(f"{path}: a device or a pipe has the place of a run's own file; remove it")
+    return os.fdopen(descriptor, "a+", encoding="utf-8")
 
 
 def read_json(path: Path) -> dict[str, Any]:

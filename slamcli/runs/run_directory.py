@@ -359,7 +359,7 @@ class RunDir:
     @contextmanager
     def lock(self, *, wait: bool = False) -> Iterator[None]:
         """Hold the run for writing; when another process does, wait or raise SlamError. What a killed process left is cleared first."""
-        with open(self.path / ".lock", "a+") as file:
+        with files.open_own(self.path / ".lock") as file:
             try:
                 fcntl.flock(file, fcntl.LOCK_EX if wait else fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:

@@ -12,6 +12,7 @@ import fakes
 import pytest
 
 from slamcli import files
+from slamcli.api import writing
 from slamcli.config.options import Config
 from slamcli.errors import SlamError
 from slamcli.runs import run_directory
@@ -221,6 +222,21 @@ def test_a_second_writer_is_refused_and_told_who_the_first_is(run: RunDir) -> No
         done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
         assert "in use by another slamcli" in done.stderr
     with RunDir(run.path).lock():
+        pass
+
+
+@pytest.mark.parametrize("name", [".lock", "log.txt"])
+def test_a_run_from_someone_else_makes_no_other_file_change_and_no_command_wait(run: RunDir, tmp_path: Path, name: str) -> None:
+    other, place = tmp_path / "precious", run.path / name
+    other.write_text("precious")
+    place.unlink(missing_ok=True)
+    place.symlink_to(other)
+    with pytest.raises(SlamError, match=f"{name}: a link has the place"), writing(run, Config()):
+        pass
+    assert other.read_text() == "precious"
+    place.unlink()
+    os.mkfifo(place)
+    with pytest.raises(SlamError, match=f"{name}: a device or a pipe has the place"), writing(run, Config()):
         pass
 
 
