@@ -275,7 +275,7 @@ class Run:
         """Write one self-contained HTML page about the run, to ``report.html`` in its directory unless `path` is given."""
         from slamcli import report
 
-        target = Path(path) if path is not None else self.path / "report.html"
+        target = Path(path) if path is not None else self.directory.own_file("report.html")
         report.make(self.directory, target)
         return target
 

@@ -44,16 +44,18 @@ _known: dict[tuple[int, ...], str] = {}  # digests of files this process has rea
 
 
 @contextmanager
-def whole(path: str | Path) -> Iterator[BinaryIO]:
+def whole(path: str | Path, *, through_links: bool = True) -> Iterator[BinaryIO]:
     """Write a file that appears under its name whole or not at all.
 
     The bytes go to a hidden file beside it, which takes the name when the block ends well and is removed when not; what a killed process
     left is taken over by the next one that writes the same file. A device or a pipe is written to, never replaced; through a link, the
     file that it leads to is. SlamError where it cannot be written; what other files raise meanwhile passes.
+
+    through_links : False replaces a link, a device or a pipe itself, as is due to a file in a run directory, which others may have sent
     """
     path = Path(path)
     with written(path):
-        place = _end_of_links(path)
+        place = _end_of_links(path) if through_links else path
         if place is None:
             with open(path, "wb") as target:
                 yield target
@@ -78,14 +80,14 @@ def clear_leftover(path: str | Path) -> None:
         file.close()
 
 
-def write_text(path: str | Path, text: str) -> None:
+def write_text(path: str | Path, text: str, *, through_links: bool = True) -> None:
     """Replace a text file at once: a reader, or a power cut, meets the old text or the new."""
-    write_bytes(path, text.encode(errors="surrogateescape"))  # a name in it that is not UTF-8 as it is
+    write_bytes(path, text.encode(errors="surrogateescape"), through_links=through_links)  # a name in it that is not UTF-8 as it is
 
 
-def write_bytes(path: str | Path, data: bytes) -> None:
-    """Replace a file at once."""
-    with whole(path) as file:
+def write_bytes(path: str | Path, data: bytes, *, through_links: bool = True) -> None:
+    """Replace a file at once; `through_links` is that of `whole`."""
+    with whole(path, through_links=through_links) as file:
         file.write(data)
 
 
@@ -141,7 +143,7 @@ def _open_part(place: Path) -> tuple[Path, BinaryIO]:
     if file is None:  # another process is writing the same file just now
         part = place.with_name(f".{name}.{secrets.token_hex(4)}.part")
         file = open(part, "xb")  # noqa: SIM115  # the caller closes it
-    if place.exists():
+    if place.exists() and not place.is_symlink():
         os.fchmod(file.fileno(), stat.S_IMODE(place.stat().st_mode))
     return part, file
 
@@ -308,7 +310,7 @@ def digest(value: Any) -> str:
 
 def write_sealed(path: Path, value: Mapping[str, Any]) -> None:
     """Write a JSON object together with its digest, so that `read_sealed` notices any change."""
-    write_text(path, sealed(value))
+    write_text(path, sealed(value), through_links=False)
 
 
 def read_sealed(path: Path) -> dict[str, Any]:

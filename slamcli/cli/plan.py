@@ -97,7 +97,7 @@ def plan(
         warn_of_doubt(folder)
         trajectory, title = camera_path(folder), str(folder.info()["dataset"])
         radius = folder.config().robot.radius if radius is None else radius
-        png = png or folder.path / "plan.png"
+        png = png or folder.own_file("plan.png")
     else:
         grid, title = _read_map(page), page.name
     radius = Config().robot.radius if radius is None else radius

@@ -101,7 +101,7 @@ def report(run: str | None, out: Path | None, with_inspection: bool) -> None:
 
     folder = RunDir.find(run)
     last_stage(folder)  # there is something to report, or this says what is missing
-    target = out or folder.path / "report.html"
+    target = out or folder.own_file("report.html")
     report_page.make(folder, target, inspected=_findings(folder) if with_inspection else ())
     click.echo(target)
 

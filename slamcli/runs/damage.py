@@ -67,7 +67,7 @@ def find(folder: Path, outputs: Mapping[str, Any], names: Iterable[str], *, veri
 def write_config(path: Path, config: Config) -> None:
     """Write a configuration that `read_config` finds unchanged."""
     text = toml.dump(config).encode()
-    write_bytes(path, text + seal(text))
+    write_bytes(path, text + seal(text), through_links=False)
 
 
 def read_config(path: Path) -> Config:

@@ -154,6 +154,13 @@ class RunDir:
         about = {"dataset": dataset, "root": root, "digest": digest, "recordings": [dict(entry) for entry in recordings]}
         self._write_info({**self.info(), **about})
 
+    def own_file(self, name: str) -> Path:
+        """Name a file that a command puts into the run; a link, a device or a pipe in its place leads elsewhere, and is removed."""
+        path = self.path / name
+        if path.is_symlink() or (path.exists() and not path.is_file() and not path.is_dir()):
+            path.unlink()
+        return path
+
     def config(self) -> Config:
         """Read the run's configuration; the defaults before there is any."""
         path = self.path / "config.toml"

@@ -240,6 +240,19 @@ def test_a_run_from_someone_else_makes_no_other_file_change_and_no_command_wait(
         pass
 
 
+@pytest.mark.parametrize("kind", ["link", "pipe"])
+def test_what_leads_out_of_a_run_is_replaced_and_not_written_through(run: RunDir, tmp_path: Path, kind: str) -> None:
+    other = tmp_path / "precious"
+    other.write_text("precious")
+    for name in ("config.toml", "run.json", "report.html"):
+        (run.path / name).unlink(missing_ok=True)
+        (run.path / name).symlink_to(other) if kind == "link" else os.mkfifo(run.path / name)
+    run.restore()
+    assert run.config() == Config() and run.info()["dataset"] == "fake"
+    assert not run.own_file("report.html").exists()
+    assert other.read_text() == "precious"
+
+
 def test_readers_need_no_lock_and_no_permission_to_write(run: RunDir) -> None:
     with run.lock():
         assert set(run.states()) == set(NAMES)
