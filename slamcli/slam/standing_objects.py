@@ -44,7 +44,7 @@ class Sightings:
     until: np.ndarray  # float16 [s]
     is_sure: np.ndarray  # bool, surely moving
     is_moving: np.ndarray  # bool, with what moves along
-    is_unconfirmed: np.ndarray  # bool, a surface that one view some time apart finds again at most
+    is_unconfirmed: np.ndarray  # bool, a surface that no view some time apart finds again
 
     @classmethod
     def none(cls, n: int, places: tuple[int, int]) -> "Sightings":
@@ -56,7 +56,7 @@ class Sightings:
         """Keep what is known of a view."""
         self.depth[frame], self.since[frame], self.until[frame] = evidence.depth, evidence.since, evidence.until
         self.is_sure[frame], self.is_moving[frame] = is_sure, is_moving
-        self.is_unconfirmed[frame] = (evidence.depth > 0) & (evidence.n_still <= 1)
+        self.is_unconfirmed[frame] = (evidence.depth > 0) & (evidence.n_still == 0)
 
     def z(self, frame: int) -> np.ndarray:
         """Return the depth (v, u) float32 [m] of a view."""
