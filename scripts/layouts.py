@@ -3,18 +3,24 @@
     python scripts/layouts.py path/to/rgbd_dataset_freiburg1_xyz --frames 200 --until loop
     python scripts/layouts.py path/to/rgbd_dataset_freiburg1_xyz --layouts mcap ros1_compressed --cost
     python scripts/layouts.py path/to/rgbd_dataset_freiburg1_xyz --frames 1000 --phone
+    python scripts/layouts.py path/to/rgbd_dataset_freiburg1_xyz --frames 20 --opening 10000
 
 Depth keeps its readings and colour its bytes; pixels of bags without compression are those of a PNG. Stamps that a layout has must come
 back bit for bit, and with them every array of features and every pose; where it has none, features are compared.
+
+`--opening` repeats the frames until a bag has as many as asked for, and fails where it takes longer to open, or more memory, than allowed.
 """
 
 import argparse
+import dataclasses
+import subprocess
 import sys
 import tempfile
 import time
 import tracemalloc
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
@@ -31,6 +37,9 @@ from slamcli.formats.trajectory import read_tum
 from slamcli.schema import Features
 
 RAW_COLOUR = ("ros1_raw", "ros1_lz4", "ros2_zstd", "mcap")
+BAGS = {"ros1": layouts.ros1, "ros2": layouts.ros2, "mcap": layouts.mcap}
+OPENING_S = 3.0  # CPU time of opening a bag at most
+OPENING_MIB = 300.0  # memory that takes at most, over that of a bag of a few frames
 
 
 def main() -> None:
@@ -42,10 +51,20 @@ def main() -> None:
     parser.add_argument("--layouts", nargs="*", default=[layout.name for layout in LAYOUTS])
     parser.add_argument("--cost", action="store_true", help="CPU time of opening and of reading all frames instead of a run")
     parser.add_argument("--phone", action="store_true", help="compare APE with that of the same frames as a phone records them, lossy")
+    parser.add_argument("--opening", type=int, metavar="N", help="measure opening a bag of N frames of each kind instead of a run")
+    parser.add_argument("--open", nargs=2, help=argparse.SUPPRESS)  # a bag of a few frames and that of N, in a process of its own
     arguments = parser.parse_args()
+    if arguments.open:
+        measure_opening(*arguments.open)
+        return
     with tempfile.TemporaryDirectory() as folder:
-        rows = as_phone(arguments, Path(folder)) if arguments.phone else compare(arguments, Path(folder))
+        if arguments.opening:
+            rows = opening(arguments, Path(folder))
+        else:
+            rows = as_phone(arguments, Path(folder)) if arguments.phone else compare(arguments, Path(folder))
     print(table(rows))
+    if arguments.opening and any(float(row[2]) > OPENING_S or float(row[3]) > OPENING_MIB for row in rows[1:]):
+        raise SystemExit(f"a bag took more than {OPENING_S:.0f} s or {OPENING_MIB:.0f} MiB to open")
 
 
 def compare(arguments: argparse.Namespace, folder: Path) -> list[list[str]]:
@@ -74,6 +93,49 @@ def compare(arguments: argparse.Namespace, folder: Path) -> list[list[str]]:
             else:
                 rows.append([layout.name, *verdict(run(path, camera, folder / f"run-{layout.name}", arguments.until), own, layout)])
     return rows
+
+
+def opening(arguments: argparse.Namespace, folder: Path) -> list[list[str]]:
+    """Write bags of JPEG colour and depth as compressedDepth, and open each in a process of its own."""
+    from datasets.test_same_recording import content_of
+
+    dataset = open_dataset(arguments.recording)
+    frames = tuple(i for i in range(len(dataset)) if np.isfinite(dataset.depth_stamp[i]))[: arguments.frames]
+    content = content_of(dataset, frames, suffix=".png")
+    jpeg = [cv2.imencode(".jpg", content.bgr(i))[1].tobytes() for i in range(len(frames))]
+    content = dataclasses.replace(content, colour=jpeg, suffix=".jpg")
+    rows = [["bag", "frames", "open [CPU s]", "memory [MiB]"]]
+    for name, write in BAGS.items():
+        paths = [str(write(repeated(content, n), folder / f"{name}_{n}", depth="png")) for n in (len(frames), arguments.opening)]
+        told = subprocess.run([sys.executable, __file__, arguments.recording, "--open", *paths], capture_output=True, text=True, check=True)
+        rows.append([name, *told.stdout.split()])
+    return rows
+
+
+def repeated(content: layouts.Content, n: int) -> layouts.Content:
+    """Repeat frames until there are n, at 30 Hz."""
+    index = np.arange(n) % len(content.stamp)
+    stamp = [content.stamp[0] + 33_333_333 * i for i in range(n)]
+    return dataclasses.replace(
+        content, stamp=stamp, depth_stamp=stamp, colour=[content.colour[i] for i in index], raw=[content.raw[i] for i in index],
+        T_wc=content.T_wc[index],
+    )  # fmt: skip
+
+
+def measure_opening(small: str, large: str) -> None:
+    """Print how many frames the large bag has, the CPU time [s] of opening it, and the memory [MiB] over that of the small one."""
+    open_dataset(small)  # libraries loaded
+    before = peak_mib()
+    start = time.process_time()
+    dataset = open_dataset(large)
+    opened = time.process_time() - start
+    print(len(dataset), f"{opened:.2f}", f"{peak_mib() - before:.0f}")
+
+
+def peak_mib() -> float:
+    """Return this program's largest memory so far; that of getrusage begins at what the parent had when it started it."""
+    status = Path("/proc/self/status").read_text()
+    return next(int(line.split()[1]) for line in status.splitlines() if line.startswith("VmHWM:")) / 1024
 
 
 def as_phone(arguments: argparse.Namespace, folder: Path) -> list[list[str]]:

@@ -411,14 +411,20 @@ def write_ros(
             return depth_topic, SENSOR_IMAGE, raw(content.metres(i), "32FC1", stamp, depth_frame)
         if depth == "16UC1":
             return depth_topic, SENSOR_IMAGE, raw(image, "16UC1", stamp, depth_frame)
+        if id(image) not in encoded:  # the images of a content live as long as this call
+            encoded[id(image)] = compressed_depth(image)
+        return f"{depth_topic}/compressedDepth", SENSOR_COMPRESSED, compressed(encoded[id(image)], kind_of_depth, stamp, depth_frame)
+
+    encoded: dict[int, bytes] = {}  # a long recording may repeat its images
+    kind_of_depth = f"16UC1; compressedDepth {depth}"
+
+    def compressed_depth(image: np.ndarray) -> bytes:
         config = struct.pack("<iff", 0, 0.0, 0.0)
         if depth == "png":
-            data, kind = config + png16(image), "16UC1; compressedDepth png"
-        elif depth == "rvl":
-            data, kind = config + struct.pack("<II", image.shape[1], image.shape[0]) + rvl(image), "16UC1; compressedDepth rvl"
-        else:
-            raise ValueError(depth)
-        return f"{depth_topic}/compressedDepth", SENSOR_COMPRESSED, compressed(data, kind, stamp, depth_frame)
+            return config + png16(image)
+        if depth == "rvl":
+            return config + struct.pack("<II", image.shape[1], image.shape[0]) + rvl(image)
+        raise ValueError(depth)
 
     def colour_message(i: int) -> tuple[str, str, object]:
         stamp, name = content.stamp[i], "/camera/color/image_raw"
