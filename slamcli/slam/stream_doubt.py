@@ -7,6 +7,7 @@ import numpy as np
 
 from slamcli.datasets import depth_unit
 from slamcli.datasets.depth_unit import DepthUnit
+from slamcli.depth.coarse_images import CoarseImages
 from slamcli.schema import Features
 from slamcli.slam import doubt
 from slamcli.slam.doubt import Finding
@@ -109,12 +110,12 @@ def same_pictures(features: Features) -> np.ndarray:
     return is_same
 
 
-def same_depth(coarse_depth: Sequence[np.ndarray]) -> np.ndarray:
+def same_depth(images: CoarseImages) -> np.ndarray:
     """Find the frames (F,) whose coarse depth image (V, U) is that of the frame before, and not of one distance or empty."""
-    is_same = np.zeros(len(coarse_depth), dtype=bool)
+    is_same = np.zeros(len(images), dtype=bool)
     for i in range(1, len(is_same)):
-        if np.array_equal(coarse_depth[i], coarse_depth[i - 1]):
-            values = coarse_depth[i][coarse_depth[i] > 0]
+        if np.array_equal(images.code(i), images.code(i - 1)):
+            values = images[i][images[i] > 0]
             is_same[i] = len(values) > 0 and values.max() > (1.0 + ONE_DISTANCE) * values.min()
     return is_same
 

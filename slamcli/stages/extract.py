@@ -1,6 +1,6 @@
 """extract: images -> ORB features with depth."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -12,10 +12,11 @@ from slamcli.config.options import Config, ExtractConfig
 from slamcli.datasets import Dataset, depth_unit
 from slamcli.datasets.recording import spread
 from slamcli.depth import at_key_points, coarse_images, icp
+from slamcli.depth.coarse_images import CoarseImages
 from slamcli.errors import BadFrame, SlamError
 from slamcli.geometry.camera import Camera
 from slamcli.parallel import ordered_map
-from slamcli.schema import CoarseDepth, Features, Flow
+from slamcli.schema import Features, Flow
 from slamcli.slam import doubt, stream_doubt
 from slamcli.slam.doubt import Finding
 from slamcli.slam.stream_doubt import Readings
@@ -34,7 +35,7 @@ class Frame:
     points: orb.KeyPoints
     depth: np.ndarray  # (N,) float32 [m]
     slope: np.ndarray  # (N, 2) float32 [1/m/px] of the inverse of depth
-    coarse: np.ndarray | None  # (V, U) uint16, None where there is no depth
+    coarse: bytes | None  # code of the coarse depth image, None where there is no depth
     faults: list[str]  # why an image could not be used
     readings: Readings | None = None  # what its depth image holds
     counts: np.ndarray | None = None  # (65536,) of a few frames: readings of each raw value
@@ -44,7 +45,7 @@ def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
     """Detect ORB features in every colour frame and read their depth."""
     n = len(inputs.dataset)
     found = frames(inputs.dataset, cfg.extract, range(n), workers=tools.workers)
-    return assemble(list(tools.progress(found, "extract", n)), inputs, out, cfg, tools)
+    return assemble(tools.progress(found, "extract", n), inputs, out, cfg, tools)
 
 
 def frames(dataset: Dataset, settings: ExtractConfig, rows: Sequence[int], *, workers: int) -> Iterator[Frame]:
@@ -52,26 +53,31 @@ def frames(dataset: Dataset, settings: ExtractConfig, rows: Sequence[int], *, wo
     return ordered_map(partial(_extract, dataset, settings), rows, workers=workers)
 
 
-def assemble(found: list[Frame], inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
-    """Write what was found in each frame of the recording."""
+def assemble(found: Iterable[Frame], inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
+    """Write what was found in each frame of the recording, in order."""
     dataset, camera = inputs.dataset, inputs.dataset.camera
-    for i, frame in enumerate(found):
-        for fault in frame.faults:
-            tools.warn(f"frame {i} skipped: {fault}" if len(frame.points) == 0 else f"frame {i} has no depth: {fault}")
-    if not any(len(frame.points) for frame in found):
+    gathered = _Gathered(len(dataset), camera, cfg.extract)
+    for frame in found:
+        gathered.add(frame)
+    n = np.diff(gathered.offset)
+    for i, faults in enumerate(gathered.faults):
+        for fault in faults:
+            tools.warn(f"frame {i} skipped: {fault}" if n[i] == 0 else f"frame {i} has no depth: {fault}")
+    features, coarse = gathered.features(dataset), gathered.codes.table()
+    if not n.any():
         blank = (
             f"{dataset.root}: no feature in any of the {len(dataset)} colour frames: are they blank? try: slamcli inspect {dataset.root}"
         )
-        if not any(frame.coarse is not None and frame.coarse.any() for frame in found):
+        images = CoarseImages(coarse)
+        if not any(images[i].any() for i in range(len(images))):
             raise SlamError(blank)
         tools.warn(f"{blank}; the camera can be tracked by the shape alone that depth shows")
-    features = _table(dataset, camera, found, cfg.extract.scale)
     artifacts.save(features, out)
-    artifacts.save(_coarse_table(camera, found), out)
-    artifacts.save(_flow_table(dataset, camera, found, tools) if cfg.extract.flow else Flow(), out)
+    artifacts.save(coarse, out)
+    artifacts.save(_flow_table(dataset, camera, gathered.raw_xy, tools) if cfg.extract.flow else Flow(), out)
     write_association(out / "frames.txt", dataset, features.depth_stamp)
     write_camera(out, camera)
-    doubts, n = _doubts(dataset, found, features), np.diff(features.offset)
+    doubts = _doubts(dataset, gathered, features, CoarseImages(coarse))
     for one in doubts:
         tools.warn(one.text)
     return {
@@ -80,17 +86,73 @@ def assemble(found: list[Frame], inputs: Inputs, out: Path, cfg: Config, tools: 
         "features_per_frame": [int(n.min()), float(np.median(n)), int(n.max())],
         "with_depth": float(np.isfinite(features.depth).mean()) if len(features.depth) else 0.0,
         "frames_without_depth": int(np.isnan(features.depth_stamp).sum()),
-        "bad_images": sum(len(frame.faults) for frame in found),
+        "bad_images": sum(len(faults) for faults in gathered.faults),
     } | doubt.to_summary(doubts)
 
 
-def _doubts(dataset: Dataset, found: list[Frame], features: Features) -> list[Finding]:
+class _Gathered:
+    """What all frames gave: their features one after another in arrays reserved for the most there can be, of which the rest takes no memory."""
+
+    def __init__(self, n_frames: int, camera: Camera, settings: ExtractConfig) -> None:
+        self._camera, self._settings = camera, settings
+        most = n_frames * settings.features
+        self._columns: dict[str, np.ndarray] = {
+            "xy": np.empty((most, 2), np.float32),
+            "depth": np.empty(most, np.float32),
+            "slope": np.empty((most, 2), np.float32),
+            "octave": np.empty(most, np.uint8),
+            "angle": np.empty(most, np.float32),
+            "desc": np.empty((most, 32), np.uint8),
+        }
+        self.offset = [0]
+        self.has_depth: list[bool] = []
+        self.codes = coarse_images.Codes(icp.coarse_shape(camera))
+        self.faults: list[list[str]] = []
+        self.readings: list[Readings | None] = []
+        self.counts: list[np.ndarray] = []
+        self.raw_xy: list[np.ndarray] = []  # (N, 2) px of each frame's key points, distorted, where they are to be followed
+
+    def add(self, frame: Frame) -> None:
+        """Add the next frame."""
+        points, first = frame.points, self.offset[-1]
+        end = first + len(points)
+        new = {
+            "xy": self._camera.undistort(points.xy),
+            "depth": frame.depth,
+            "slope": frame.slope,
+            "octave": points.octave,
+            "angle": points.angle,
+            "desc": points.desc,
+        }
+        for name, values in new.items():
+            self._columns[name][first:end] = values
+        self.offset.append(end)
+        self.has_depth.append(frame.coarse is not None)
+        self.codes.add(frame.coarse)
+        self.faults.append(frame.faults)
+        self.readings.append(frame.readings)
+        if frame.counts is not None:
+            self.counts.append(frame.counts)
+        if self._settings.flow:
+            self.raw_xy.append(points.xy)
+
+    def features(self, dataset: Dataset) -> Features:
+        """Return the features of all frames."""
+        return Features(
+            stamp=np.asarray(dataset.stamp, dtype=np.float64),
+            depth_stamp=np.where(self.has_depth, dataset.depth_stamp, np.nan),
+            offset=np.array(self.offset, dtype=np.int64),
+            octave_scale=np.array(self._settings.scale),
+            **{name: column[: self.offset[-1]] for name, column in self._columns.items()},
+        )
+
+
+def _doubts(dataset: Dataset, gathered: _Gathered, features: Features, coarse: CoarseImages) -> list[Finding]:
     """Judge whether the images are what a camera sees."""
-    counts = [frame.counts for frame in found if frame.counts is not None]
-    coarse = [frame.coarse if frame.coarse is not None else np.zeros(0, np.uint16) for frame in found]
+    counts, scale = gathered.counts, depth_unit.counting_scale(dataset.camera.depth_scale)
     return [
-        *stream_doubt.about_readings([frame.readings for frame in found]),
-        *(stream_doubt.about_unit(np.sum(counts, axis=0), depth_unit.counting_scale(dataset.camera.depth_scale)) if counts else []),
+        *stream_doubt.about_readings(gathered.readings),
+        *(stream_doubt.about_unit(np.sum(counts, axis=0), scale) if counts else []),
         *stream_doubt.about_motion(features.stamp, stream_doubt.same_pictures(features), stream_doubt.same_depth(coarse)),
     ]
 
@@ -115,7 +177,7 @@ def _extract(dataset: Dataset, settings: ExtractConfig, i: int) -> Frame:
     if settings.depth_jump:
         read = np.where(at_key_points.is_behind_outline(depth, points.xy, jump=settings.depth_jump), np.float32(np.nan), read)
     slope, readings = at_key_points.inverse_depth_slope(depth, points.xy), stream_doubt.look(depth)
-    return Frame(points, read, slope, icp.coarsen(depth), faults, readings, _counts(dataset, depth, i))
+    return Frame(points, read, slope, coarse_images.code_of(icp.coarsen(depth)), faults, readings, _counts(dataset, depth, i))
 
 
 def _counts(dataset: Dataset, depth: np.ndarray, i: int) -> np.ndarray | None:
@@ -125,38 +187,17 @@ def _counts(dataset: Dataset, depth: np.ndarray, i: int) -> np.ndarray | None:
     return depth_unit.counted_metres(depth, depth_unit.counting_scale(dataset.camera.depth_scale))
 
 
-def _table(dataset: Dataset, camera: Camera, found: list[Frame], scale: float) -> Features:
-    points = [frame.points for frame in found]
-    raw = np.concatenate([p.xy for p in points])
-    return Features(
-        stamp=np.asarray(dataset.stamp, dtype=np.float64),
-        depth_stamp=np.where([frame.coarse is not None for frame in found], dataset.depth_stamp, np.nan),
-        offset=np.cumsum([0] + [len(p) for p in points], dtype=np.int64),
-        xy=camera.undistort(raw).astype(np.float32),
-        depth=np.concatenate([frame.depth for frame in found]),
-        slope=np.concatenate([frame.slope for frame in found]),
-        octave=np.concatenate([p.octave for p in points]),
-        angle=np.concatenate([p.angle for p in points]),
-        desc=np.concatenate([p.desc for p in points]),
-        octave_scale=np.array(scale),
-    )
-
-
-def _coarse_table(camera: Camera, found: list[Frame]) -> CoarseDepth:
-    return coarse_images.encode((frame.coarse for frame in found), icp.coarse_shape(camera))
-
-
-def _flow_table(dataset: Dataset, camera: Camera, found: list[Frame], tools: Tools) -> Flow:
-    """Follow the key points of every frame into the next one."""
+def _flow_table(dataset: Dataset, camera: Camera, raw_xy: list[np.ndarray], tools: Tools) -> Flow:
+    """Follow the key points (N, 2) [px] of every frame, as they are in its image, into the next one."""
 
     def follow(i: int) -> np.ndarray:
-        xy, n = found[i].points.xy, len(found)
-        if i + 1 == n or len(xy) == 0 or len(found[i + 1].points) == 0:
+        xy, n = raw_xy[i], len(raw_xy)
+        if i + 1 == n or len(xy) == 0 or len(raw_xy[i + 1]) == 0:
             return np.full((len(xy), 2), np.nan, np.float32)
         return optical_flow.follow(dataset.grey(i), dataset.grey(i + 1), xy)
 
-    followed = ordered_map(follow, range(len(found)), workers=tools.workers)
-    raw = np.concatenate(list(tools.progress(followed, "flow", len(found))))
+    followed = ordered_map(follow, range(len(raw_xy)), workers=tools.workers)
+    raw = np.concatenate(list(tools.progress(followed, "flow", len(raw_xy))))
     is_found = np.isfinite(raw[:, 0])
     raw[is_found] = camera.undistort(raw[is_found])
     return Flow(flow_xy=raw)

@@ -5,6 +5,8 @@ import pytest
 from boxroom import KINECT, kinect_noise, look_along, render
 
 from slamcli.datasets import depth_unit
+from slamcli.depth import coarse_images
+from slamcli.depth.coarse_images import CoarseImages
 from slamcli.slam import stream_doubt
 
 RATE = 15.0  # [Hz]
@@ -77,8 +79,9 @@ def test_equal_depth_images_are_found_and_empty_or_flat_ones_are_none() -> None:
     rng = np.random.default_rng(0)
     images = [rng.integers(5000, 20000, (6, 8)).astype(np.uint16) for _ in range(3)]
     nothing, flat = np.zeros((6, 8), np.uint16), np.full((6, 8), 9000, np.uint16)
-    same = stream_doubt.same_depth([images[0], images[0].copy(), images[1], images[1].copy(), images[2], nothing, nothing, flat, flat])
-    assert same.tolist() == [False, True, False, True] + [False] * 5
+    kept = [images[0], images[0], images[1], images[1], images[2], nothing, nothing, flat, flat, None, None]
+    same = stream_doubt.same_depth(CoarseImages(coarse_images.encode(kept, nothing.shape)))
+    assert same.tolist() == [False, True, False, True] + [False] * 7
 
 
 @pytest.mark.parametrize(("factor", "likely"), [(1.0, None), (1.5, 7500.0), (1 / 1.5, 3400.0), (1.3, 6500.0)])
