@@ -236,6 +236,7 @@ def _record(folder: RunDir, file: str, figures: dict) -> None:
     target = folder.path / "eval" / file
     try:
         with files.written(target):
+            folder.own_file("eval")  # as a link it would lead out of the run
             target.parent.mkdir(exist_ok=True)
             files.write_sealed(target, figures)
     except SlamError as error:

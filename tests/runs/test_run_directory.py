@@ -13,6 +13,7 @@ import pytest
 
 from slamcli import files
 from slamcli.api import writing
+from slamcli.cli import evaluate
 from slamcli.config.options import Config
 from slamcli.errors import SlamError
 from slamcli.runs import run_directory
@@ -251,6 +252,14 @@ def test_what_leads_out_of_a_run_is_replaced_and_not_written_through(run: RunDir
     assert run.config() == Config() and run.info()["dataset"] == "fake"
     assert not run.own_file("report.html").exists()
     assert other.read_text() == "precious"
+
+
+def test_figures_are_kept_within_the_run_and_not_where_a_link_in_it_leads(run: RunDir, tmp_path: Path) -> None:
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    (run.path / "eval").symlink_to(elsewhere)
+    evaluate._record(run, "ape.json", {"rmse": 0.1})
+    assert not list(elsewhere.iterdir()) and files.read_sealed(run.path / "eval" / "ape.json")["rmse"] == 0.1
 
 
 def test_readers_need_no_lock_and_no_permission_to_write(run: RunDir) -> None:
