@@ -50,9 +50,9 @@ def judge(views: Views, moving: np.ndarray, hidden: np.ndarray, first: tuple[Tra
     share = hidden.mean(axis=(1, 2)) if len(hidden) else np.zeros(n)
     support = np.minimum(LANDMARK_SIGMA / np.maximum(tracks.n_inliers, 1), np.where(_on_depth(*final), DEPTH_SIGMA, WORST_SIGMA))
     sigma = np.sqrt(BASE_SIGMA**2 + support**2 + np.nan_to_num(disagreement) ** 2)
-    is_doubtful = (sigma > DOUBTFUL_SIGMA) | (np.nan_to_num(contradicted) > CONTRADICTED) | (share > MOVING) | (tracks.ref_kf < 0)
-    is_doubtful |= np.nan_to_num(disagreement) > DISAGREEMENT
-    is_blind = (np.nan_to_num(contradicted) > CONTRADICTED) | (tracks.ref_kf < 0) | ((share > MOVING) & (tracks.n_inliers < SHOWN))
+    is_wrong, is_crowded = (np.nan_to_num(contradicted) > CONTRADICTED) | (tracks.ref_kf < 0), share > MOVING
+    is_doubtful = is_wrong | is_crowded | (sigma > DOUBTFUL_SIGMA) | (np.nan_to_num(disagreement) > DISAGREEMENT)
+    is_blind = is_wrong | (is_crowded & (tracks.n_inliers < SHOWN))
     drift = _drift(tracks, final[1], is_blind) if len(hidden) else np.zeros(n)
     is_doubtful |= drift > DOUBTFUL_DRIFT
     sigma = np.where(tracks.ref_kf >= 0, sigma, np.nan)

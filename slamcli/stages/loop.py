@@ -33,7 +33,8 @@ FEWEST_KEY_FRAMES = 2  # of a map in which no place can be seen again
 def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
     """Join map segments and close loops until no new one appears; then look at all key frames and frames again."""
     tracks, when, camera = inputs.load(Tracks, "optimize"), inputs.load(Timing, "optimize"), inputs.camera("optimize")
-    features, depth = moving_parts.still(inputs, inputs.load(Moving, "track"))
+    hidden = inputs.load(Moving, "track")
+    features, depth = moving_parts.still(inputs, hidden)
     features = measurements.corrected(inputs, features, inputs.camera(), Sensing(camera, when, {}))
     frames = FrameStore(features, camera, cfg.sensor)
     sparse_map = SparseMap.from_map(features, inputs.load(Map, "optimize"))
@@ -53,10 +54,9 @@ def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
     several = place_recordings(inputs, out, tracks, map_) if when.is_of_several else None
     for apart in several.warnings() if several is not None else segments_apart(tracks, map_):
         tools.warn(apart)
-    moving, motion = find_moving(inputs, tracks, map_, several, tools)
+    moving, motion = find_moving(inputs, hidden, tracks, map_, several, tools)
     first = inputs.load(Tracks, "track"), inputs.load(Map, "track")
-    hidden = inputs.load(Moving, "track").moving
-    doubts = pose_doubt.judge(moving_parts.views(inputs, tracks, map_), moving.moving, hidden, first, (tracks, map_))
+    doubts = pose_doubt.judge(moving_parts.views(inputs, tracks, map_), moving.moving, hidden.moving, first, (tracks, map_))
     for artifact in (moving, doubts, when, closures_of(accepted)):
         artifacts.save(artifact, out)
     write_camera(out, camera)
@@ -102,11 +102,14 @@ def look_again(
     return refined
 
 
-def find_moving(inputs: Inputs, tracks: Tracks, map_: Map, several: of_several.Placed | None, tools: Tools) -> tuple[Moving, Summary]:
-    """Find what the maps are to leave out: what moves, and what a later recording shows to be gone; returns also how much moves."""
-    moving = inputs.load(Moving, "track")
-    if len(moving.moving):
-        moving = moving_parts.find(inputs, tracks, map_, tools, rule=FOR_MAPS)
+def find_moving(
+    inputs: Inputs, hidden: Moving, tracks: Tracks, map_: Map, several: of_several.Placed | None, tools: Tools
+) -> tuple[Moving, Summary]:
+    """Find what the maps are to leave out: what moves, and what a later recording shows to be gone; returns also how much moves.
+
+    hidden : what tracking left out; where it is nothing, nothing moves
+    """
+    moving = moving_parts.find(inputs, tracks, map_, tools, rule=FOR_MAPS) if len(hidden.moving) else hidden
     motion = moving_parts.figures(moving)
     if several is not None:
         moving = moving_parts.with_gone(inputs, moving, several.recording_of_frame, tracks, map_, tools)

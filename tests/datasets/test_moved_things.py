@@ -71,9 +71,9 @@ def test_the_door_turns_about_its_hinge_from_the_wall_while_it_is_in_view(seed: 
     assert turned[0] < 1e-6 and turned[-1] == pytest.approx(moved_things.OPENS_BY) and (np.diff(turned) >= -1e-6).all()
     assert 0.7 * moved_things.OPENS_IN < stamp[turning[-1]] - stamp[turning[0]] <= moved_things.OPENS_IN
     assert moved_things._is_in_view(motion, T[0, :3, 3])[turning].mean() > 0.9
-    low, high = build(Simulation(seed=seed, frames=FRAMES, laps=1.2))[0].low, build(Simulation(seed=seed, frames=FRAMES, laps=1.2))[0].high
+    scene, _ = build(Simulation(seed=seed, frames=FRAMES, laps=1.2))
     corners = (T[:, None] @ np.array([[sx * half[0], sy * half[1], 0.0, 1.0] for sx in (-1, 1) for sy in (-1, 1)])[..., None])[:, :, :2, 0]
-    assert (corners > low[:2]).all() and (corners < high[:2]).all()
+    assert (corners > scene.low[:2]).all() and (corners < scene.high[:2]).all()
 
 
 @pytest.mark.parametrize("seed", [61, 63, 65])

@@ -7,7 +7,7 @@ import numpy as np
 from slamcli.datasets.simulated import furniture, picture
 from slamcli.datasets.simulated.brush import pick
 from slamcli.datasets.simulated.drive import Motion
-from slamcli.datasets.simulated.figures import BOX, Figure, Part
+from slamcli.datasets.simulated.figures import BOX, Figure, Part, standing_at
 from slamcli.datasets.simulated.scene import Doorway, Solid, box
 from slamcli.geometry.algebra import product
 
@@ -86,9 +86,8 @@ def _middle(doorway: Doorway) -> np.ndarray:
 
 def _upright(centre: np.ndarray, yaw: np.ndarray) -> np.ndarray:
     """Return poses (N, 4, 4) in the level frame of things that stand upright, turned by `yaw` (N,)."""
-    T = np.tile(np.eye(4), (len(yaw), 1, 1))
-    c, s = np.cos(yaw), np.sin(yaw)
-    T[:, 0, 0], T[:, 0, 1], T[:, 1, 0], T[:, 1, 1], T[:, :3, 3] = c, -s, s, c, centre
+    T = standing_at(centre[:, :2], yaw)
+    T[:, 2, 3] = centre[:, 2]
     return T
 
 
