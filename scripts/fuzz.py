@@ -77,13 +77,13 @@ def main() -> int:
     options.add_argument("--atheris", action="store_true", help="let atheris steer the mutations of one parser")
     given = options.parse_args()
     warnings.simplefilter("ignore")
-    said, mute = os.fdopen(os.dup(2), "w"), os.open(os.devnull, os.O_WRONLY)
-    os.dup2(mute, 2)  # libpng and its like tell of every fault
     n_failures = 0
     with tempfile.TemporaryDirectory(dir="/dev/shm" if Path("/dev/shm").is_dir() else None) as folder:
         known = {**parsers(), **recordings(Path(folder) / "recordings"), **runs(Path(folder) / "runs")}
         if unknown := set(given.parsers) - known.keys():
             options.error(f"no such parser: {', '.join(sorted(unknown))}; there are {', '.join(known)}")
+        said, mute = os.fdopen(os.dup(2), "w"), os.open(os.devnull, os.O_WRONLY)
+        os.dup2(mute, 2)  # libpng and its like tell of every fault
         for name in given.parsers or known:
             if given.atheris:
                 steer(known[name], Path(folder))

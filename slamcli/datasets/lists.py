@@ -175,7 +175,7 @@ def _number_first(text: str) -> re.Match | None:
 
 
 def _is_nanoseconds(seconds: float, rest: float) -> bool:
-    return seconds > EARLIEST and seconds == int(seconds) and 0 <= rest < NANOSECONDS and rest == int(rest)
+    return seconds > EARLIEST and seconds.is_integer() and 0 <= rest < NANOSECONDS and rest.is_integer()  # never infinite
 
 
 def _pair_row(tokens: list[str]) -> tuple[list[float], list[str], list[float], list[float]] | None:

@@ -168,6 +168,7 @@ CASES = {
     "old macintosh line ends": Case(lambda d: [(d / n).write_bytes((d / n).read_bytes().replace(b"\n", b"\r")) for n in ("rgb.txt", "depth.txt")]),
     "columns swapped": Case(rewrite(lambda t, f: f"{f} {t:.6f}")),
     "an index before": Case(rewrite(lambda t, f: f"{round(t * 30)}, {t:.6f}, {f}")),
+    "an index before that no number holds": Case(rewrite(lambda t, f: f"{'9' * 400}, {t:.6f}, {f}")),
     "seconds and nanoseconds": Case(rewrite(lambda t, f: f"{int(EPOCH + t)},{round((t % 1) * 1e9)},{f}")),
     "a heading": Case(rewrite(lambda t, f: f"{t:.6f} {f}" if t else f"timestamp filename\n{t:.6f} {f}")),
     "every line twice": Case(rewrite(lambda t, f: f"{t:.6f} {f}\n{t:.6f} {f}"), said="repeated lines left out"),
