@@ -14,6 +14,7 @@ import slamcli
 from slamcli.dense.occupancy import OccupancyMap
 from slamcli.depth import icp
 from slamcli.estimation import bundle_adjustment
+from slamcli.estimation.bundle_problem import Problem, Variables
 from slamcli.geometry import octree, se3
 from slamcli.schema import LOST, Features, Map, Matches, Tracks, Words, frame_poses
 from slamcli.slam.recording import Recording
@@ -100,7 +101,8 @@ def adjust(run: slamcli.Run, map_: Map) -> None:
     T_kw = sparse_map.T_kw(part.kfs)
     moved = T_kw.copy()
     moved[-1] = se3.exp(np.array([0.02, 0.0, 0.0, 0.0, 0.0, 0.0])) @ moved[-1]
-    found = bundle_adjustment.adjust(moved, sparse_map.lm.xyz[part.ids], part.seen, camera, is_fixed=part.is_fixed)
+    start = Variables(moved, sparse_map.lm.xyz[part.ids])
+    found = bundle_adjustment.adjust(Problem(start, part.seen, camera, is_fixed=part.is_fixed))
 
     print(f"bundle_adjustment.adjust(), {len(part.kfs)} key frames and {len(part.ids)} landmarks")
     line(

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from slamcli.estimation import bundle_adjustment
-from slamcli.estimation.bundle_problem import Observations, Problem
+from slamcli.estimation.bundle_problem import Observations, Problem, Variables
 from slamcli.estimation.robust_loss import HUBER
 from slamcli.geometry import se3
 from slamcli.geometry.camera import Camera
@@ -62,17 +62,20 @@ def compare(n_kf: int, n_lm: int, seed: int, *, repeats: int, iterations: int = 
     sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))  # the same oracle as the tests use
     from g2o_bundle import G2oBundle
 
-    problem = drive(n_kf, n_lm, seed)
+    given = drive(n_kf, n_lm, seed)
     is_fixed = np.arange(n_kf) == 0
-    print(f"{n_kf} key frames, {n_lm} landmarks, {len(problem[2])} observations")
+    print(f"{n_kf} key frames, {n_lm} landmarks, {len(given[2])} observations")
     with tempfile.TemporaryDirectory() as folder:
 
         def build() -> G2oBundle:
-            return G2oBundle(*problem, is_fixed=is_fixed, limits=HUBER, folder=Path(folder))
+            return G2oBundle(*given, is_fixed=is_fixed, limits=HUBER, folder=Path(folder))
 
-        adjust = {"is_fixed": is_fixed, "tolerance": 0.0}
-        short = bundle_adjustment.adjust(*problem, max_iterations=iterations, **adjust)  # compiles
-        prepared = Problem(*problem, is_fixed)
+        def problem() -> Problem:
+            T_cw, x_w, seen, camera = given
+            return Problem(Variables(T_cw, x_w), seen, camera, is_fixed=is_fixed)
+
+        prepared = problem()
+        short = bundle_adjustment.adjust(prepared, max_iterations=iterations, tolerance=0.0)  # compiles
         g2o_ms = loop_ms = total_ms = built_ms = np.inf
         for _ in range(repeats):  # in turn, so that what else the machine does meets both
             peer = build()
@@ -80,15 +83,15 @@ def compare(n_kf: int, n_lm: int, seed: int, *, repeats: int, iterations: int = 
             g2o_ms = min(g2o_ms, cpu_ms(lambda peer=peer: peer.optimize(iterations)) / iterations)
             after = peer.cost()
             loop_ms = min(loop_ms, cpu_ms(lambda: bundle_adjustment.minimize(prepared, max_iterations=iterations, tolerance=0.0)))
-            built_ms = min(built_ms, cpu_ms(lambda: Problem(*problem, is_fixed)))
-            total_ms = min(total_ms, cpu_ms(lambda: bundle_adjustment.adjust(*problem, max_iterations=iterations, **adjust)))
+            built_ms = min(built_ms, cpu_ms(problem))
+            total_ms = min(total_ms, cpu_ms(lambda: bundle_adjustment.adjust(problem(), max_iterations=iterations, tolerance=0.0)))
         for _ in range(60):
             before = peer.cost()
             peer.optimize(10)
             if before - peer.cost() <= 1e-9 * before:
                 break
         g2o_cost = peer.cost()
-    final = bundle_adjustment.adjust(*problem, max_iterations=100, is_fixed=is_fixed, tolerance=1e-12)
+    final = bundle_adjustment.adjust(prepared, max_iterations=100, tolerance=1e-12)
     print(f"  cost at the start         ours {short.cost[0]:.6f}  g2o {start:.6f}  difference {short.cost[0] / start - 1:+.1e}")
     print(f"  cost after {iterations} iterations  ours {short.cost[-1]:.6f}  g2o {after:.6f}")
     print(f"  cost at the end           ours {final.cost[-1]:.6f}  g2o {g2o_cost:.6f}  difference {final.cost[-1] / g2o_cost - 1:+.1e}")

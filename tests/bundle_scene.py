@@ -5,9 +5,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from slamcli.estimation.bundle_adjustment import BundleResult
-from slamcli.estimation.bundle_problem import Observations, Problem
+from slamcli.estimation.bundle_problem import Observations, Problem, Variables
 from slamcli.estimation.relative_pose_factors import NO_EDGES, Edges
-from slamcli.estimation.robust_loss import LEAST_SQUARES
+from slamcli.estimation.robust_loss import HUBER, LEAST_SQUARES, Huber
 from slamcli.geometry import se3
 from slamcli.geometry.camera import Camera
 
@@ -30,9 +30,15 @@ class Scene:
     sigma_z: np.ndarray
 
     @property
-    def problem(self) -> tuple:
+    def given(self) -> tuple:
+        """What slow twins and g2o take."""
         seen = Observations(self.obs_kf, self.obs_lm, self.xy, self.depth, self.sigma_px, self.sigma_z)
         return self.T_cw, self.x_w, seen, CAMERA
+
+    def problem(self, *, is_fixed: np.ndarray | None = None, edges: Edges = NO_EDGES, loss: Huber = HUBER) -> Problem:
+        """What is adjusted, with the first key frame fixed if nothing else is said."""
+        T_cw, x_w, seen, camera = self.given
+        return Problem(Variables(T_cw, x_w), seen, camera, is_fixed=self.first if is_fixed is None else is_fixed, edges=edges, loss=loss)
 
     @property
     def first(self) -> np.ndarray:
@@ -72,7 +78,7 @@ def pose_error(T: np.ndarray, T_true: np.ndarray) -> np.ndarray:
 
 def covariance(scene: Scene, found: BundleResult, kfs: list[int], edges: Edges = NO_EDGES) -> np.ndarray:
     """Joint covariance of the left twists of key frames after an adjustment that held the first: the inverse of the reduced camera system."""
-    problem = Problem(found.T_cw, found.x_w, *scene.problem[2:], scene.first, edges, LEAST_SQUARES)
+    problem = replace(scene, T_cw=found.T_cw, x_w=found.x_w).problem(edges=edges, loss=LEAST_SQUARES)
     problem.linearize(problem.start)
     problem.eliminate(1e-9, np.zeros(len(problem.hold)))
     inverse = problem.system.factorize().solve(np.eye(6 * len(problem.hold)))

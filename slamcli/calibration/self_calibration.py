@@ -135,8 +135,8 @@ def _ask(
     """Make the problem whose optimum the map is, what each unknown does to its measurements (O, 3, G), and the depth that offsets turn about."""
     if len(part.row) == 0 or not prior:
         return None
-    T_kw, x_w = sparse_map.T_kw(part.kfs), sparse_map.lm.xyz[part.ids]
-    problem = Problem(T_kw, x_w, part.seen, now.camera, part.is_fixed, part.edges, LEAST_SQUARES)
+    start = part.start(sparse_map)
+    problem = Problem(start, part.seen, now.camera, is_fixed=part.is_fixed, edges=part.edges, loss=LEAST_SQUARES)
     predicted = problem.in_given_order(problem.predict(problem.start))
     seen = Predictions(sparse_map.features, part.row, predicted, now.camera, now.timing)
     columns = [derivative(name, seen, sigma=sigma) for name, sigma in prior.items()]

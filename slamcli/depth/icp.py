@@ -126,16 +126,13 @@ def surface_points(coarse_depth: np.ndarray, camera: Camera, sensor: SensorConfi
     """
     small, row_at = coarse_camera(camera)
     depth = camera.reread(coarse_depth.astype(np.float32) * np.float32(UNIT), given or camera)
-    noise = noise_model.reading_noise(sensor)
-    seen = oriented_points.surface(
-        depth, small, settings=CLEANING, noise=noise, stride=1, spacing=0.0, depth_min=sensor.depth_min, depth_max=sensor.depth_max
-    )
+    seen = oriented_points.surface(depth, small, settings=CLEANING, sensor=sensor, stride=1, spacing=0.0)
     row = np.full(depth.size + 1, -1, dtype=np.int32)
     row[seen.pixel] = np.arange(len(seen.pixel), dtype=np.int32)
     return OrientedPoints(
         xyz=seen.xyz_c,
         normal=seen.normal_c,
-        variance=np.square(depth_noise.sigmas(seen.xyz_c[:, 2], noise)).astype(np.float32),
+        variance=np.square(depth_noise.sigmas(seen.xyz_c[:, 2], noise_model.reading_noise(sensor))).astype(np.float32),
         row=row[row_at],
         pinhole=np.array([small.fx, small.fy, small.cx, small.cy]),
     )

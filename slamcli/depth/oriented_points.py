@@ -7,7 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from numba import f4, f8, i4, i8
 
-from slamcli.config.options import SurfaceConfig
+from slamcli.config.options import SensorConfig, SurfaceConfig
+from slamcli.depth import noise_model
 from slamcli.geometry import depth_noise, elementary
 from slamcli.geometry.camera import Camera
 from slamcli.geometry.depth_noise import DepthNoise
@@ -48,11 +49,9 @@ def surface(
     camera: Camera,
     *,
     settings: SurfaceConfig,
-    noise: DepthNoise,
+    sensor: SensorConfig,
     stride: int,
     spacing: float,
-    depth_min: float,
-    depth_max: float,
 ) -> Surface:
     """Find the pixels of a depth image (H, W) [m] that lie on a surface; smooth their depth and give the normals.
 
@@ -62,7 +61,7 @@ def surface(
     A plane's inverse depth is linear in the pixel. So two pixels opposite each other, as seen from a third, have its inverse depth on
     average, however slanted the plane: such pairs are averaged where they agree within the noise, and their differences give the normal.
 
-    noise : of a single reading
+    sensor : how well a single reading measures, and in what range
     stride : every stride-th row and column is looked at, and where that is so near that the points lie closer together than `spacing`
         [m], every second or fourth of these
     """
@@ -76,11 +75,12 @@ def surface(
         near=float(spacing * max(camera.fx, camera.fy) / stride),
         edge=settings.edge,
         window=float(settings.window),
-        low=1.0 / depth_max,
-        high=1.0 / max(depth_min, NEAREST),
+        low=1.0 / sensor.depth_max,
+        high=1.0 / max(sensor.depth_min, NEAREST),
         min_cosine=float(elementary.cos(steepest)),
         steepest=float(elementary.tan(steepest)) / camera.fx,
     )
+    noise = noise_model.reading_noise(sensor)
     n = _find_surface(inverse, _rays(camera), sought, noise, out.pixel, out.xyz_c, out.normal_c, out.weight)
     return Surface(out.pixel[:n], out.xyz_c[:n], out.normal_c[:n], out.weight[:n])
 

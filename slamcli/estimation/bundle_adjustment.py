@@ -7,10 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slamcli.estimation.bundle_problem import Observations, Problem, Variables
-from slamcli.estimation.relative_pose_factors import NO_EDGES, Edges
-from slamcli.estimation.robust_loss import HUBER, Huber
-from slamcli.geometry.camera import Camera
+from slamcli.estimation.bundle_problem import Problem, Variables
 
 DAMPING_START, DAMPING_MIN, DAMPING_MAX = 1e-5, 1e-9, 1e8  # factor on the diagonal of the normal equations; beyond, no step lowers the cost
 LARGEST_RELIEF = 0.1  # factor on the damping after a step that the linearized problem foretold well
@@ -30,22 +27,9 @@ class BundleResult:
     is_converged: bool
 
 
-def adjust(
-    T_cw: np.ndarray,
-    x_w: np.ndarray,
-    seen: Observations,
-    camera: Camera,
-    *,
-    is_fixed: np.ndarray,
-    edges: Edges = NO_EDGES,
-    loss: Huber = HUBER,
-    max_iterations: int = 10,
-    tolerance: float = 1e-5,
-) -> BundleResult:
-    """Adjust the free key frames and all landmarks to pixels and depths.
+def adjust(problem: Problem, *, max_iterations: int = 10, tolerance: float = 1e-5) -> BundleResult:
+    """Adjust the free key frames and all landmarks of a problem to pixels and depths, from its start.
 
-    T_cw : (K, 4, 4); x_w : (L, 3) [m]; is_fixed : (K,) bool, key frames that stay
-    edges : relative poses of key frames that were measured besides
     tolerance : share of the cost; an iteration that lowers it by less ends the adjustment
 
     Minimizes the sum of the loss over observations and edges; chi2 of an observation is
@@ -53,7 +37,6 @@ def adjust(
     A landmark seen once is adjusted with its depth; with one bearing alone it bears on nothing. Values that are not finite switch
     their observation off.
     """
-    problem = Problem(T_cw, x_w, seen, camera, is_fixed, edges, loss)
     found = minimize(problem, max_iterations=max_iterations, tolerance=tolerance)
     chi2 = problem.chi2(found.at)
     return BundleResult(

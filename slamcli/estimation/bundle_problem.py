@@ -60,32 +60,37 @@ class Problem:
 
     def __init__(
         self,
-        T_cw: np.ndarray,
-        x_w: np.ndarray,
+        start: Variables,
         seen: Observations,
         camera: Camera,
+        *,
         is_fixed: np.ndarray,
         edges: Edges = NO_EDGES,
         loss: Huber = HUBER,
     ) -> None:
-        """Take what `adjust` takes; raises ValueError where the observations are not sorted by landmark."""
+        """Take a start, which is copied, and what is known of it; raises ValueError where the observations are not sorted by landmark.
+
+        start : T_cw (K, 4, 4), x_w (L, 3) [m]; is_fixed : (K,) bool, key frames that stay
+        edges : relative poses of key frames that were measured besides
+        """
         obs_kf, obs_lm = np.asarray(seen.kf, dtype=np.int64), np.asarray(seen.lm, dtype=np.int64)
         if (np.diff(obs_lm) < 0).any():
             raise ValueError("observations must be sorted by landmark")
-        x = np.array(x_w, dtype=np.float64, order="C").reshape(-1, 3)
+        x = np.array(start.x_w, dtype=np.float64, order="C").reshape(-1, 3)
         self.is_finite_landmark = np.all(np.isfinite(x), axis=1)
         x[~self.is_finite_landmark] = 0.0  # NaN would spread
-        self.start = Variables(np.array(T_cw, dtype=np.float64, order="C"), x)
+        self.start = Variables(np.array(start.T_cw, dtype=np.float64, order="C"), x)
+        n_kf = len(self.start.T_cw)
         measured = _measurements(seen, self.is_finite_landmark[obs_lm])
-        n_seen = np.bincount(obs_kf[measured[:, INV_SIGMA_PX] > 0.0], minlength=len(T_cw))
-        n_seen += FEW_OBSERVATIONS * np.bincount(edges.kf.ravel(), minlength=len(T_cw))  # an edge determines a pose by itself
+        n_seen = np.bincount(obs_kf[measured[:, INV_SIGMA_PX] > 0.0], minlength=n_kf)
+        n_seen += FEW_OBSERVATIONS * np.bincount(edges.kf.ravel(), minlength=n_kf)  # an edge determines a pose by itself
         free = np.flatnonzero(~np.asarray(is_fixed, dtype=bool) & (n_seen > 0))
-        self.place, self.system = order_and_blocks(free, obs_kf, obs_lm, len(T_cw), edges.kf)
+        self.place, self.system = order_and_blocks(free, obs_kf, obs_lm, n_kf, edges.kf)
         self.hold = np.zeros(len(free))
         self.hold[self.place[free]] = np.where(n_seen[free] < FEW_OBSERVATIONS, HOLD, 0.0)
         self._edge_terms = EdgeTerms(edges, self.place, self.system.block_of)
         offset = np.searchsorted(obs_lm, np.arange(len(x) + 1)).astype(np.int64)
-        self.order = _stable_order(obs_lm * (len(T_cw) + 1) + self.place[obs_kf] + 1)
+        self.order = _stable_order(obs_lm * (n_kf + 1) + self.place[obs_kf] + 1)
         self.measured = measured[self.order]
         self._seen = Sightings(obs_kf[self.order].astype(np.uint64), offset, self.place)
         self._camera = np.array([camera.fx, camera.fy, camera.cx, camera.cy], dtype=np.float64)

@@ -7,13 +7,11 @@ import numpy as np
 from slamcli.estimation import pose_kernels as kernels
 from slamcli.estimation.measurements import Measurements
 from slamcli.estimation.minimal_solvers import p3p, rigid3
+from slamcli.estimation.pose_kernels import Agreement, Hypotheses, Seen
 from slamcli.estimation.robust_loss import HUBER, Huber
 from slamcli.geometry import se3
 from slamcli.geometry.algebra import product
 from slamcli.geometry.camera import Camera
-
-# Levenberg-Marquardt between two sortings into inliers and outliers, and how often they are sorted at most, as in ORB-SLAM.
-ITERATIONS, ROUNDS = 10, 4
 
 
 @dataclass(frozen=True)
@@ -38,21 +36,35 @@ class RigidMotion:
     rms: float  # px, in camera b, of the inliers
 
 
+@dataclass(frozen=True)
+class Ransac:
+    """How many samples are drawn, and which pairs agree with what one of them says."""
+
+    rounds: int = 100  # samples at most
+    threshold_px: float = 4.0  # reprojection error of an inlier
+    confidence: float = 0.9999  # rounds end early once a sample free of outliers has been drawn with this probability
+
+    def agreement(self, camera: Camera, size: int) -> Agreement:
+        """Return it as the kernel takes it, with samples of `size` points."""
+        return Agreement(camera.fx, camera.fy, self.threshold_px * self.threshold_px, size, self.confidence)
+
+
+@dataclass(frozen=True)
+class SeenPoints:
+    """Points as one camera sees them."""
+
+    x_c: np.ndarray  # (N, 3) m, in the camera's frame
+    xy: np.ndarray  # (N, 2) px, undistorted
+
+
 def ransac_p3p(
-    x_w: np.ndarray,
-    xy: np.ndarray,
-    camera: Camera,
-    *,
-    rng: np.random.Generator,
-    rounds: int = 100,
-    threshold_px: float | np.ndarray = 4.0,
-    confidence: float = 0.9999,
+    x_w: np.ndarray, xy: np.ndarray, camera: Camera, *, rng: np.random.Generator, ransac: Ransac = Ransac()
 ) -> PoseEstimate | None:
     """Find the camera pose that most landmarks agree with.
 
-    x_w : (N, 3) [m], xy : (N, 2) [px, undistorted]; threshold_px : scalar or (N,)
-    Each round solves P3P on three pairs and lets a fourth choose among its solutions. Rounds end early once a sample free of outliers
-    has been drawn with the given confidence. None where there are fewer than four pairs or no sample had a solution.
+    x_w : (N, 3) [m], xy : (N, 2) [px, undistorted]
+    Each round solves P3P on three pairs and lets a fourth choose among its solutions.
+    None where there are fewer than four pairs or no sample had a solution.
 
     [Z] 1.2; M. Fischler, R. Bolles, CACM 1981, doi:10.1145/358669.358692
     """
@@ -60,46 +72,35 @@ def ransac_p3p(
     if n < 4:
         return None
     x_w, ray = _points(x_w), _rays(xy, camera)
-    sample = draw_samples(rng, n, rounds, 4)
+    sample = draw_samples(rng, n, ransac.rounds, 4)
     solutions = p3p(x_w[sample[:, :3]], np.concatenate([ray, np.ones((n, 1))], axis=1)[sample[:, :3]])
     T = _best_of_four(solutions, x_w[sample[:, 3]], ray[sample[:, 3]])
     is_inlier = np.zeros(n, dtype=np.bool_)
-    best, done = kernels.rank(
-        T, T, x_w, ray, x_w, ray, False, camera.fx, camera.fy, _squared(threshold_px, n), 4, confidence, is_inlier
-    )  # fmt: skip
+    tested = Hypotheses(T, x_w, ray)
+    best, done = kernels.rank(tested, tested, False, ransac.agreement(camera, 4), is_inlier)
     return None if best < 0 else _ransac_estimate(T[best], is_inlier, done, _rms(T[best], x_w, ray, camera, is_inlier))
 
 
 def ransac_rigid(
-    x_a: np.ndarray,
-    x_b: np.ndarray,
-    xy_a: np.ndarray,
-    xy_b: np.ndarray,
-    camera: Camera,
-    *,
-    rng: np.random.Generator,
-    rounds: int = 100,
-    threshold_px: float | np.ndarray = 4.0,
-    confidence: float = 0.9999,
+    a: SeenPoints, b: SeenPoints, camera: Camera, *, rng: np.random.Generator, ransac: Ransac = Ransac()
 ) -> RigidMotion | None:
     """Find the rigid motion between two cameras that most point pairs agree with.
 
-    x_a, x_b : (N, 3) [m], the same landmarks in the frames of camera a and b; xy_a, xy_b : (N, 2) [px, undistorted] where each camera
-    saw them. A pair is an inlier when point a falls within the threshold of xy_b and point b within the threshold of xy_a.
+    a, b : the same N landmarks as camera a and as camera b sees them
+    A pair is an inlier when its point in a falls within the threshold of its pixel in b, and its point in b within that of its pixel in a.
     None where there are fewer than three pairs or no sample spanned a plane.
     """
-    n = len(x_a)
+    n = len(a.x_c)
     if n < 3:
         return None
-    x_a, x_b, ray_a, ray_b = _points(x_a), _points(x_b), _rays(xy_a, camera), _rays(xy_b, camera)
-    sample = draw_samples(rng, n, rounds, 3)
+    x_a, x_b, ray_a, ray_b = _points(a.x_c), _points(b.x_c), _rays(a.xy, camera), _rays(b.xy, camera)
+    sample = draw_samples(rng, n, ransac.rounds, 3)
     T_ba = rigid3(x_a[sample], x_b[sample])
     R_ab = np.swapaxes(T_ba[:, :, :3], 1, 2)
     T_ab = np.ascontiguousarray(np.concatenate([R_ab, product(-R_ab, T_ba[:, :, 3:])], axis=2))
     is_inlier = np.zeros(n, dtype=np.bool_)
-    best, _ = kernels.rank(
-        T_ba, T_ab, x_a, ray_b, x_b, ray_a, True, camera.fx, camera.fy, _squared(threshold_px, n), 3, confidence, is_inlier
-    )  # fmt: skip
+    there, back = Hypotheses(T_ba, x_a, ray_b), Hypotheses(T_ab, x_b, ray_a)
+    best, _ = kernels.rank(there, back, True, ransac.agreement(camera, 3), is_inlier)
     if best < 0:
         return None
     return RigidMotion(_matrix(T_ba[best]), is_inlier, _rms(T_ba[best], x_a, ray_b, camera, is_inlier))
@@ -114,10 +115,10 @@ def refine_pose(T_cw: np.ndarray, x_w: np.ndarray, measured: Measurements, camer
     to doubt is an outlier.
     """
     start, is_inlier = se3.orthonormalize(T_cw), np.empty(len(x_w), dtype=np.bool_)
-    columns = (_cast(measured.xy), _cast(measured.depth), _cast(measured.sigma_px), _cast(measured.sigma_z))
-    T, H, cost, total, rms = kernels.refine(
-        start, _points(x_w), *columns, _intrinsics(camera), *loss, loss.is_robust, ROUNDS, ITERATIONS, is_inlier
-    )
+    with np.errstate(divide="ignore"):  # a standard deviation of 0 gives a weight that is not finite: an outlier
+        weights = (1.0 / _cast(measured.sigma_px), 1.0 / _cast(measured.sigma_z))
+    seen = Seen(_points(x_w), _cast(measured.xy), _cast(measured.depth), *weights)
+    T, H, cost, total, rms = kernels.refine(start, seen, _intrinsics(camera), loss, is_inlier)
     return PoseEstimate(
         T_cw=T,
         is_inlier=is_inlier,
@@ -187,10 +188,6 @@ def _points(x: np.ndarray) -> np.ndarray:
 
 def _rays(xy: np.ndarray, camera: Camera) -> np.ndarray:
     return (_cast(xy).reshape(-1, 2) - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
-
-
-def _squared(threshold_px: float | np.ndarray, n: int) -> np.ndarray:
-    return np.ascontiguousarray(np.broadcast_to(np.square(np.asarray(threshold_px, dtype=np.float64)), (n,)))
 
 
 def _intrinsics(camera: Camera) -> np.ndarray:

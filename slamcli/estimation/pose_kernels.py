@@ -4,9 +4,12 @@ Poses are arrays [R | t], (3, 4) or (4, 4). `ray` is the undistorted pixel on th
 sensor gave none. All arrays are C-contiguous float64 unless said otherwise.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import b1, f8, i8
 
+from slamcli.estimation.robust_loss import Huber
 from slamcli.geometry import elementary
 from slamcli.geometry.cholesky import solve_damped
 from slamcli.geometry.se3 import left_update
@@ -15,11 +18,50 @@ from slamcli.jit.kernel import kernel
 Z_MIN = 1e-2  # [m] a landmark nearer to the image plane than this, or behind it, has no projection
 CHI2_BEHIND = 1e6  # what such an observation costs: more than any that can be seen, yet finite
 DAMPING_START, DAMPING_MIN, DAMPING_MAX = 1e-4, 1e-9, 1e6  # factor on the diagonal; beyond, no step lowers the cost
+# Levenberg-Marquardt between two sortings into inliers and outliers, and how often they are sorted at most, as in ORB-SLAM.
+ITERATIONS, ROUNDS = 10, 4
+
+
+class Hypotheses(NamedTuple):
+    """Motions of which each is to bring all points onto their rays."""
+
+    T: f8[:, :, ::1]  # (M, 3, 4), one per round; NaN = its sample had no solution
+    p: f8[:, ::1]  # (N, 3) m
+    ray: f8[:, ::1]  # (N, 2)
+
+
+class Agreement(NamedTuple):
+    """When a point agrees with a hypothesis, and when enough hypotheses were looked at."""
+
+    fx: f8  # px
+    fy: f8
+    threshold2: f8  # px^2, squared reprojection error of an inlier
+    size: i8  # points of a sample
+    confidence: f8  # of having drawn a sample of inliers alone
+
+
+class Seen(NamedTuple):
+    """Observations of landmarks, and how well they measure."""
+
+    x_w: f8[:, ::1]  # (N, 3) m; NaN = never in front of the camera
+    xy: f8[:, ::1]  # (N, 2) px
+    depth: f8[::1]  # (N,) m
+    inv_px: f8[::1]  # (N,) 1/px, inverse standard deviations
+    inv_z: f8[::1]  # (N,) 1/m
+
+
+class System(NamedTuple):
+    """What observations say of a pose: of a small motion of it, and how well each agrees."""
+
+    H: f8[:, ::1]  # (6, 6)
+    b: f8[::1]  # (6,)
+    chi2: f8[::1]  # (N,)
 
 
 @kernel(error_model="numpy")
-def _reprojection2(T, p, ray, i, fx, fy):
-    """Squared reprojection error [px^2] of point p[i] under pose T (3, 4) against ray[i]."""
+def _reprojection2(tested, h, i, fx, fy):
+    """Squared reprojection error [px^2] of point i under hypothesis h."""
+    T, p, ray = tested.T[h], tested.p, tested.ray
     z = T[2, 0] * p[i, 0] + T[2, 1] * p[i, 1] + T[2, 2] * p[i, 2] + T[2, 3]
     if not z > Z_MIN:
         return CHI2_BEHIND
@@ -29,41 +71,27 @@ def _reprojection2(T, p, ray, i, fx, fy):
 
 
 @kernel(error_model="numpy")
-def rank(
-    T: f8[:, :, ::1],
-    T_back: f8[:, :, ::1],
-    p: f8[:, ::1],
-    ray: f8[:, ::1],
-    p_back: f8[:, ::1],
-    ray_back: f8[:, ::1],
-    is_two_way: b1,
-    fx: f8,
-    fy: f8,
-    threshold2: f8[::1],
-    size: i8,
-    confidence: f8,
-    is_inlier: b1[::1],
-):
-    """Find the best of the hypotheses T (M, 3, 4), one per round; write its inliers; return its number, -1 = none, and the rounds done.
+def rank(there: Hypotheses, back: Hypotheses, is_two_way: b1, rule: Agreement, is_inlier: b1[::1]):
+    """Find the best of the hypotheses; write its inliers; return its number, -1 = none, and the rounds done.
 
-    Point p[i] is to fall on ray[i] under T and, if is_two_way, p_back[i] on ray_back[i] under T_back. Hypotheses are ranked by the
-    truncated sum of squares (P. Torr, A. Zisserman, MLESAC, CVIU 2000, doi:10.1006/cviu.1999.0832). Rounds end once a sample of `size`
-    inliers was drawn with the given confidence.
+    back : if is_two_way, the inverse motions, under which the other camera's points are to fall on their rays, too
+    Hypotheses are ranked by the truncated sum of squares (P. Torr, A. Zisserman, MLESAC, CVIU 2000, doi:10.1006/cviu.1999.0832). Rounds
+    end once a sample of inliers alone was drawn with the confidence of the rule.
     """
-    n = len(p)
-    best, best_score, needed, done = -1, np.inf, len(T), 0
+    n, n_hypotheses, threshold2 = len(there.p), len(there.T), rule.threshold2
+    best, best_score, needed, done = -1, np.inf, n_hypotheses, 0
     while done < needed:
         h = done
         done += 1
-        if T[h, 0, 0] != T[h, 0, 0]:
+        if there.T[h, 0, 0] != there.T[h, 0, 0]:
             continue
         score, count = 0.0, 0
         for i in range(n):
-            error = _reprojection2(T[h], p, ray, i, fx, fy)
+            error = _reprojection2(there, h, i, rule.fx, rule.fy)
             if is_two_way:
-                error = max(error, _reprojection2(T_back[h], p_back, ray_back, i, fx, fy))
-            if error < threshold2[i]:
-                score += error / threshold2[i]
+                error = max(error, _reprojection2(back, h, i, rule.fx, rule.fy))
+            if error < threshold2:
+                score += error / threshold2
                 count += 1
             else:
                 score += 1.0
@@ -71,26 +99,30 @@ def rank(
                 break
         if score < best_score and count > 0:
             best, best_score = h, score
-            missed = 1.0 - elementary.whole_power(count / n, size)
+            missed = 1.0 - elementary.whole_power(count / n, rule.size)
             if missed < 1.0:
-                needed = 0 if missed <= 0.0 else min(len(T), int(elementary.logarithm(1.0 - confidence) / elementary.logarithm(missed)) + 1)
+                rounds = 0 if missed <= 0.0 else int(elementary.logarithm(1.0 - rule.confidence) / elementary.logarithm(missed)) + 1
+                needed = min(n_hypotheses, rounds)
     if best >= 0:
         for i in range(n):
-            error = _reprojection2(T[best], p, ray, i, fx, fy)
+            error = _reprojection2(there, best, i, rule.fx, rule.fy)
             if is_two_way:
-                error = max(error, _reprojection2(T_back[best], p_back, ray_back, i, fx, fy))
-            is_inlier[i] = error < threshold2[i]
+                error = max(error, _reprojection2(back, best, i, rule.fx, rule.fy))
+            is_inlier[i] = error < threshold2
     return best, done
 
 
 @kernel(error_model="numpy")
-def normal_equations(T, x_w, xy, depth, inv_px, inv_z, is_used, camera, chi2_px, chi2_depth, robust, chi2, H, b):
-    """Accumulate H = sum w J^T J (upper triangle) and b = -sum w J^T r at pose T; write chi2 (N,); return the robust cost.
+def normal_equations(T, seen, is_used, camera, loss, out):
+    """Write H = sum w J^T J (upper triangle), b = -sum w J^T r, and chi2 at pose T; return the robust cost.
 
     J is minus (8), as r = prediction - measurement, with the row of the depth residual below it:
     d z / d xi = [0 0 1 Y -X 0]. w is Huber's weight of the whole observation.
     """
+    x_w, xy, depth, inv_px, inv_z = seen
+    H, b, chi2 = out
     fx, fy, cx, cy = camera[0], camera[1], camera[2], camera[3]
+    robust = np.isfinite(loss.pixel) and np.isfinite(loss.with_depth)
     h00 = h02 = h03 = h04 = h05 = h11 = h12 = h13 = h14 = h15 = h22 = h23 = h24 = h25 = 0.0
     h33 = h34 = h35 = h44 = h45 = h55 = b0 = b1 = b2 = b3 = b4 = b5 = cost = 0.0
     for i in range(len(x_w)):
@@ -99,16 +131,16 @@ def normal_equations(T, x_w, xy, depth, inv_px, inv_z, is_used, camera, chi2_px,
         if not z > Z_MIN:
             chi2[i] = CHI2_BEHIND
             if is_used[i]:
-                cost += 2.0 * np.sqrt(chi2_px * CHI2_BEHIND) if robust else CHI2_BEHIND
+                cost += 2.0 * np.sqrt(loss.pixel * CHI2_BEHIND) if robust else CHI2_BEHIND
             continue
         x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
         y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
         inv = 1.0 / z
         ru, rv = (fx * x * inv + cx - xy[i, 0]) * inv_px[i], (fy * y * inv + cy - xy[i, 1]) * inv_px[i]
         a, d = fx * inv * inv_px[i], fy * inv * inv_px[i]
-        rz, e, limit = 0.0, 0.0, chi2_px
+        rz, e, limit = 0.0, 0.0, loss.pixel
         if depth[i] == depth[i]:
-            rz, e, limit = (z - depth[i]) * inv_z[i], inv_z[i], chi2_depth
+            rz, e, limit = (z - depth[i]) * inv_z[i], inv_z[i], loss.with_depth
         s = ru * ru + rv * rv + rz * rz
         chi2[i] = s
         if not is_used[i]:
@@ -173,64 +205,49 @@ def _rms(T, x_w, xy, camera, is_inlier):
 
 
 @kernel(error_model="numpy")
-def refine(
-    T: f8[:, ::1],
-    given_x_w: f8[:, ::1],
-    xy: f8[:, ::1],
-    given_depth: f8[::1],
-    sigma_px: f8[::1],
-    sigma_z: f8[::1],
-    camera: f8[::1],
-    chi2_px: f8,
-    chi2_depth: f8,
-    robust: b1,
-    rounds: i8,
-    iterations: i8,
-    is_inlier: b1[::1],
-):
+def refine(T: f8[:, ::1], given: Seen, camera: f8[::1], loss: Huber, is_inlier: b1[::1]):
     """Levenberg-Marquardt on T (4, 4), with the inliers (N,) found anew after each round, in place.
 
+    given : as it was measured; camera : fx, fy, cx, cy [px]
     is_inlier : written; an observation with a value that is not finite is never one
     Returns the pose, its information (6, 6), the robust cost of the inliers, the iterations done, and the root
     mean square reprojection error [px] of the inliers, NaN without any.
     """
-    n = len(given_x_w)
-    x_w, depth, inv_px, inv_z = np.empty((n, 3)), np.empty(n), np.empty(n), np.empty(n)
+    n = len(given.x_w)
+    seen = Seen(np.empty((n, 3)), given.xy, np.empty(n), given.inv_px, given.inv_z)
     for i in range(n):
-        inv_px[i], inv_z[i] = 1.0 / sigma_px[i], 1.0 / sigma_z[i]
+        x, y, z, is_deep = given.x_w[i, 0], given.x_w[i, 1], given.x_w[i, 2], np.isfinite(given.inv_z[i]) and np.isfinite(given.depth[i])
         # A sum is finite when all its terms are.
-        is_inlier[i] = np.isfinite(given_x_w[i, 0] + given_x_w[i, 1] + given_x_w[i, 2] + xy[i, 0] + xy[i, 1] + inv_px[i])
+        is_inlier[i] = np.isfinite(x + y + z + given.xy[i, 0] + given.xy[i, 1] + given.inv_px[i])
         for k in range(3):  # NaN is never in front of the camera: an outlier from the start
-            x_w[i, k] = given_x_w[i, k] if is_inlier[i] else np.nan
-        depth[i] = given_depth[i] if np.isfinite(inv_z[i]) and np.isfinite(given_depth[i]) else np.nan
-    trial, H, H_trial, b, b_trial = np.empty((4, 4)), np.empty((6, 6)), np.empty((6, 6)), np.empty(6), np.empty(6)
-    chi2, chi2_trial, step, L = np.empty(n), np.empty(n), np.empty(6), np.empty((6, 6))
+            seen.x_w[i, k] = given.x_w[i, k] if is_inlier[i] else np.nan
+        seen.depth[i] = given.depth[i] if is_deep else np.nan
+    at, at_trial = System(np.empty((6, 6)), np.empty(6), np.empty(n)), System(np.empty((6, 6)), np.empty(6), np.empty(n))
+    trial, step, L = np.empty((4, 4)), np.empty(6), np.empty((6, 6))
     total = 0
-    cost = normal_equations(T, x_w, xy, depth, inv_px, inv_z, is_inlier, camera, chi2_px, chi2_depth, robust, chi2, H, b)
-    for _ in range(rounds):
+    cost = normal_equations(T, seen, is_inlier, camera, loss, at)
+    for _ in range(ROUNDS):
         damping = DAMPING_START
-        for _ in range(iterations):
+        for _ in range(ITERATIONS):
             total += 1
-            if not solve_damped(H, b, damping, L, step):
+            if not solve_damped(at.H, at.b, damping, L, step):
                 damping *= 10.0
                 if damping > DAMPING_MAX:
                     break
                 continue
             expected = 0.0
             for i in range(6):
-                expected += step[i] * (b[i] + damping * H[i, i] * step[i])
+                expected += step[i] * (at.b[i] + damping * at.H[i, i] * step[i])
             if expected <= 1e-9 * (1.0 + cost):
                 break
             for i in range(4):  # trial[:, :] = T would take 6 s to compile, for the text of the error its shape check may raise
                 for j in range(4):
                     trial[i, j] = T[i, j]
             left_update(trial, step)
-            cost_trial = normal_equations(
-                trial, x_w, xy, depth, inv_px, inv_z, is_inlier, camera, chi2_px, chi2_depth, robust, chi2_trial, H_trial, b_trial
-            )
+            cost_trial = normal_equations(trial, seen, is_inlier, camera, loss, at_trial)
             if cost_trial < cost:
                 cost = cost_trial
-                T, trial, H, H_trial, b, b_trial, chi2, chi2_trial = trial, T, H_trial, H, b_trial, b, chi2_trial, chi2
+                T, trial, at, at_trial = trial, T, at_trial, at
                 damping = max(DAMPING_MIN, 0.1 * damping)
             else:
                 damping *= 10.0
@@ -238,14 +255,14 @@ def refine(
                     break
         changed = False
         for i in range(n):
-            inside = chi2[i] <= (chi2_depth if depth[i] == depth[i] else chi2_px)
+            inside = at.chi2[i] <= (loss.with_depth if seen.depth[i] == seen.depth[i] else loss.pixel)
             if inside != is_inlier[i]:
                 is_inlier[i] = inside
                 changed = True
         if not changed:
             break
-        cost = normal_equations(T, x_w, xy, depth, inv_px, inv_z, is_inlier, camera, chi2_px, chi2_depth, robust, chi2, H, b)
+        cost = normal_equations(T, seen, is_inlier, camera, loss, at)
     for i in range(6):
         for j in range(i):
-            H[i, j] = H[j, i]
-    return T, H, cost, total, _rms(T, x_w, xy, camera, is_inlier)
+            at.H[i, j] = at.H[j, i]
+    return T, at.H, cost, total, _rms(T, seen.x_w, seen.xy, camera, is_inlier)

@@ -19,7 +19,7 @@ from slamcli.slam import frame_refinement
 from slamcli.slam.depth_tracking import FramePoints
 from slamcli.slam.localizer import KnownMap, Localizer
 from slamcli.slam.place_recognition import PlaceIndex
-from slamcli.slam.recording import Recording
+from slamcli.slam.recording import Recording, TrackedRecording
 from slamcli.sparse_map.frame import FrameStore
 from slamcli.sparse_map.sparse_map import SparseMap
 from slamcli.stages import measurements
@@ -102,5 +102,6 @@ def _refine(
     for _ in range(LOOKS):
         moving = replace(when, twist=rolling_shutter.frame_twists(frames.features.stamp, tracks, map_))
         rectified = replace(frames, features=rolling_shutter.rectify(frames.features, moving, frames.camera))
-        tracks = frame_refinement.refine_frames(sparse_map, rectified, tracks, config.track, progress, workers=config.run.workers)
+        tracked = TrackedRecording(rectified, tracks)
+        tracks = frame_refinement.refine_frames(sparse_map, tracked, config.track, progress, workers=config.run.workers)
     return tracks

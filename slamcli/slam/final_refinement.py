@@ -9,12 +9,11 @@ from slamcli.config.options import TrackConfig
 from slamcli.estimation.bundle_adjustment import BundleResult
 from slamcli.geometry import se3
 from slamcli.geometry.algebra import product
-from slamcli.schema import Rests, Timing, Tracks
-from slamcli.slam import rests
+from slamcli.schema import Timing, Tracks
 from slamcli.slam.depth_tracking import DepthAligner, FramePoints
 from slamcli.slam.frame_refinement import refine_frames
+from slamcli.slam.recording import TrackedRecording
 from slamcli.sparse_map import map_adjustment
-from slamcli.sparse_map.frame import FrameStore
 from slamcli.sparse_map.sparse_map import SparseMap
 
 SHARED = 30  # landmarks of two key frames whose depth images are aligned too
@@ -37,26 +36,25 @@ class Refinement:
     settings: TrackConfig
     depth: DepthEdges
     iterations: int  # of the adjustment
-    stands_still: Rests = rests.NONE  # when the camera does: the frames of a rest get one pose
 
 
 def refine_all(
-    sparse_map: SparseMap, frames: FrameStore, tracks: Tracks, by: Refinement, *, progress, workers: int = 1
+    sparse_map: SparseMap, tracked: TrackedRecording, by: Refinement, *, progress, workers: int = 1
 ) -> tuple[Tracks, BundleResult | None]:
     """Align the depth images of covisible key frames, adjust the map, and refine every frame against it.
 
-    sparse_map : its map is changed; frames : of the recording that it is of, corrected by what is known of the camera
+    sparse_map : its map is changed; tracked : the recording that it is of, its features corrected by what is known of the camera
     workers : threads; the result is the same with any number
     Returns the refined tracks, and the evidence of the adjustment, None where nothing ties two key frames together.
     """
-    depth = by.depth
+    frames, depth = tracked.frames, by.depth
     if depth.most:
         T_cd = rolling_shutter.depth_to_colour(frames.features, depth.timing, sparse_map.kf.frame)
         points = depth.points.under(frames.camera)
         DepthAligner(sparse_map, points, points).join_covisible(T_cd, most=depth.most, least=SHARED, workers=workers)
     kfs = np.arange(len(sparse_map.kf), dtype=np.int32)
     result = map_adjustment.adjust(sparse_map, kfs, frames.camera, frames.sensor, max_iterations=by.iterations, edge_weight=depth.weight)
-    tracks = refine_frames(sparse_map, frames, tracks, by.settings, progress, workers=workers, stands_still=by.stands_still)
+    tracks = refine_frames(sparse_map, tracked, by.settings, progress, workers=workers)
     return move_key_frames(sparse_map, tracks), result
 
 

@@ -11,8 +11,8 @@ from slamcli.geometry.algebra import product
 from slamcli.parallel import ordered_map
 from slamcli.schema import KEY_FRAME, LOST, ON_DEPTH, RELOCALIZED, Rests, Tracks
 from slamcli.slam import rests
+from slamcli.slam.recording import TrackedRecording
 from slamcli.sparse_map import landmark_pose
-from slamcli.sparse_map.frame import FrameStore
 from slamcli.sparse_map.guided_matching import Landmarks
 from slamcli.sparse_map.sparse_map import SparseMap
 
@@ -22,35 +22,26 @@ KEPT = 1000  # frames whose features stay in memory, some 60 kB each
 LOST_WIDENING = 8.0  # a lost frame's neighbour stands where a frame's fast turn leaves it, some tens of pixels off
 
 
-def refine_frames(
-    sparse_map: SparseMap,
-    frames: FrameStore,
-    tracks: Tracks,
-    settings: TrackConfig,
-    progress,
-    *,
-    workers: int = 1,
-    stands_still: Rests = rests.NONE,
-) -> Tracks:
+def refine_frames(sparse_map: SparseMap, tracked: TrackedRecording, settings: TrackConfig, progress, *, workers: int = 1) -> Tracks:
     """Refine every frame against the landmarks around it; lost ones are tried from both sides.
 
-    frames, tracks : of a recording, which may be another than the map is of; workers : threads
-    stands_still : when the camera does: the frames of a rest get one pose, of as many as that takes
+    tracked : a recording, which may be another than the map is of; workers : threads
+    The frames of a rest get one pose, of as many as that takes.
     A frame keeps its pose where much fewer landmarks agree than before, and a key frame also where so few do that depth held it.
     Returns new Tracks; the map stays as it is.
     """
-    refinement = _FrameRefinement(sparse_map, frames, tracks, settings)
-    refinement.refine_known(~rests.left_out(stands_still, len(tracks.state)), progress, workers=workers)
+    refinement = _FrameRefinement(sparse_map, tracked, settings)
+    refinement.refine_known(~rests.left_out(tracked.stands_still, len(tracked.frames)), progress, workers=workers)
     refinement.find_lost()
-    refinement.unite_rests(stands_still)
+    refinement.unite_rests(tracked.stands_still)
     return refinement.tracks()
 
 
 class _FrameRefinement:
     """The poses of frames, refined one after the other."""
 
-    def __init__(self, sparse_map: SparseMap, frames: FrameStore, tracks: Tracks, settings: TrackConfig) -> None:
-        self._sparse_map, self._frames, self._settings = sparse_map, frames, settings
+    def __init__(self, sparse_map: SparseMap, tracked: TrackedRecording, settings: TrackConfig) -> None:
+        self._sparse_map, self._frames, self._settings, tracks = sparse_map, tracked.frames, settings, tracked.tracks
         self._limits = landmark_pose.search_limits(settings)
         self._T_wc = np.full(tracks.T_kc.shape, np.nan)  # each in the world of its segment
         has_pose = tracks.ref_kf >= 0

@@ -6,6 +6,7 @@ import numpy as np
 
 from slamcli.config.options import TrackConfig
 from slamcli.estimation import camera_pose
+from slamcli.estimation.camera_pose import Ransac
 from slamcli.geometry import se3
 from slamcli.schema import Matches
 from slamcli.sparse_map import landmark_pose
@@ -67,14 +68,8 @@ def estimate(
         return None
     best = landmark_pose.refine(predicted, found.x_w, frame, found.row)
     if 2 * best.n_inliers <= len(found):
-        start = camera_pose.ransac_p3p(
-            found.x_w,
-            frame.xy[found.row],
-            frame.camera,
-            rng=rng,
-            rounds=settings.ransac_rounds,
-            threshold_px=settings.ransac_threshold_px,
-        )
+        ransac = Ransac(settings.ransac_rounds, settings.ransac_threshold_px)
+        start = camera_pose.ransac_p3p(found.x_w, frame.xy[found.row], frame.camera, rng=rng, ransac=ransac)
         if start is not None:
             best = max(best, landmark_pose.refine(start.T_cw, found.x_w, frame, found.row), key=lambda e: e.n_inliers)
     return best if best.n_inliers >= settings.min_inliers else None

@@ -2,6 +2,7 @@
 
 import itertools
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -22,14 +23,20 @@ from slamcli.sparse_map.sparse_map import SparseMap
 MOVED_M, MOVED_RAD = 0.005, 0.003  # a pixel or two: verification looks for landmarks in windows of sixteen
 
 
-def no_objection(found: Join) -> str:
-    """Object to no join: parts of one recording are joined when several closures agree."""
+def no_objection(_: Join | Candidate) -> str:
+    """Object to nothing."""
     return ""
 
 
-def no_doubt(closure: Candidate) -> str:
-    """Object to no closure."""
-    return ""
+@dataclass(frozen=True)
+class Objections:
+    """Who says why what looks alike cannot be one place, "" when it can."""
+
+    to_join: Callable[[Join], str] = no_objection  # of two segments; those of one recording are joined when several closures agree
+    to_closure: Callable[[Candidate], str] = no_objection  # of the two sides of a verified closure within one segment
+
+
+NO_OBJECTIONS = Objections()
 
 
 def has_moved(before: np.ndarray, after: np.ndarray) -> bool:
@@ -48,26 +55,22 @@ class LoopCloser:
         frames: FrameStore,
         settings: LoopConfig,
         rng: np.random.Generator,
-        *,
-        progress: Callable[..., Iterable],
-        objection: Callable[[Join], str] = no_objection,
-        doubt: Callable[[Candidate], str] = no_doubt,
+        objections: Objections = NO_OBJECTIONS,
     ) -> None:
-        """Take the map with the words and frames of the recording that it is of.
-
-        progress : wraps the candidates while they are verified
-        objection, doubt : say why two segments, and the two sides of a verified closure within one, cannot be one place, "" when they can
-        """
+        """Take the map with the words and frames of the recording that it is of."""
         self._sparse_map, self._words, self._frames, self._settings, self._rng = sparse_map, words, frames, settings, rng
-        self._progress, self._objection, self._doubt = progress, objection, doubt
+        self._objections = objections
         self._places = PlaceIndex(words, sparse_map.kf.frame)
         self.fate: dict[tuple[int, int], Candidate] = {}
 
-    def close_loops(self) -> list[Candidate]:
-        """Join segments, then search, verify and correct while that brings new closures. Returns all candidates with their fate."""
+    def close_loops(self, progress: Callable[..., Iterable]) -> list[Candidate]:
+        """Join segments, then search, verify and correct while that brings new closures. Returns all candidates with their fate.
+
+        progress : wraps the candidates while they are verified
+        """
         self.join_segments()
         for _ in range(self._settings.rounds):
-            closures, T_wk = self._verify(self._propose()), self._sparse_map.kf.T_wk.copy()
+            closures, T_wk = self._verify(progress(self._propose(), "loop")), self._sparse_map.kf.T_wk.copy()
             kept = self._correct(closures) if closures else []
             if not kept:
                 break
@@ -86,7 +89,7 @@ class LoopCloser:
         self._note(c for c in tried if not c.is_accepted)
         refused: list[Join] = []
         while found := map_merging.find_join(self._sparse_map, left, least=self._settings.join_closures, refused=refused):
-            if reason := self._objection(found):
+            if reason := self._objections.to_join(found):
                 refused.append(found)
                 claims = {(c.kf_i, c.kf_j) for c in found.closures}
                 self._note(c.rejected(reason) for c in found.closures)
@@ -105,7 +108,7 @@ class LoopCloser:
         candidates += find_by_pose(self._sparse_map, self._places, self._settings)
         return [c for c in candidates if not self._is_between_segments(c)]
 
-    def _verify(self, candidates: list[Candidate]) -> list[Candidate]:
+    def _verify(self, candidates: Iterable[Candidate]) -> list[Candidate]:
         """Verify the candidates that claim no revisit decided before; returns those accepted."""
         # One closure joins its whole neighbourhood: fusion finds the rest. And where the graph contradicted one, words would only
         # name its like again; what the present poses name is another idea.
@@ -113,13 +116,13 @@ class LoopCloser:
         closed = Claims((c for c in fates if c.is_accepted), span=span)
         contradicted = Claims((c for c in fates if not c.is_accepted and c.T_ij is not None), span=span)
         accepted = []
-        for candidate in self._progress(candidates, "loop"):
+        for candidate in candidates:
             if closed.cover(candidate) or (
                 not candidate.is_by_pose and (contradicted.cover(candidate) or self._matches_too_little(candidate))
             ):
                 continue
             verified = self._verified(candidate)
-            if verified.is_accepted and (reason := self._doubt(verified)):
+            if verified.is_accepted and (reason := self._objections.to_closure(verified)):
                 verified = verified.rejected(reason)
             self._note([verified])
             if verified.is_accepted:

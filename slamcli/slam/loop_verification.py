@@ -6,6 +6,7 @@ import numpy as np
 
 from slamcli.config.options import LoopConfig
 from slamcli.estimation import camera_pose
+from slamcli.estimation.camera_pose import Ransac, SeenPoints
 from slamcli.geometry import se3
 from slamcli.geometry.algebra import product
 from slamcli.schema import Words
@@ -35,18 +36,9 @@ def verify(
     candidate = replace(candidate, n_matches=len(rows))
     if len(rows) < settings.min_matches:
         return candidate.rejected(f"{len(rows)} of {settings.min_matches} matches")
-    x_i = frames.camera.backproject(frame_i.xy[rows[:, 0]], frame_i.depth[rows[:, 0]])
-    x_j = frames.camera.backproject(frame_j.xy[rows[:, 1]], frame_j.depth[rows[:, 1]])
-    start = camera_pose.ransac_rigid(
-        x_j,
-        x_i,
-        frame_j.xy[rows[:, 1]],
-        frame_i.xy[rows[:, 0]],
-        frames.camera,
-        rng=rng,
-        rounds=settings.ransac_rounds,
-        threshold_px=settings.ransac_threshold_px,
-    )
+    seen_i, seen_j = _points(frame_i, rows[:, 0]), _points(frame_j, rows[:, 1])
+    ransac = Ransac(settings.ransac_rounds, settings.ransac_threshold_px)
+    start = camera_pose.ransac_rigid(seen_j, seen_i, frames.camera, rng=rng, ransac=ransac)
     if start is None:
         return candidate.rejected("no rigid motion explains the matches")
     T_iw = product(start.T_ba, se3.inverse(sparse_map.kf.T_wk[candidate.kf_j]))
@@ -57,6 +49,11 @@ def find_again(sparse_map: SparseMap, candidate: Candidate, T_iw: np.ndarray, fr
     """Look for the landmarks around key frame j in key frame i, from a guess of its pose T_iw in the world that j stands in."""
     frame_i = frames[int(sparse_map.kf.frame[candidate.kf_i])]
     return _find_landmarks(sparse_map, candidate, frame_i, T_iw, settings)
+
+
+def _points(frame: FrameFeatures, rows: np.ndarray) -> SeenPoints:
+    """Lift some of a frame's features to where their depth puts them."""
+    return SeenPoints(frame.camera.backproject(frame.xy[rows], frame.depth[rows]), frame.xy[rows])
 
 
 def _described(frame: FrameFeatures, words: Words) -> hamming.Described:

@@ -1,10 +1,10 @@
-"""What tracking takes of a recording: its frames as the stages before left them, and what is known of the camera's motion beforehand."""
+"""What tracking takes of a recording: its frames as the stages before left them, what is known of the camera's motion; and what it leaves."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from slamcli.schema import Matches, Rests, Words
+from slamcli.schema import Matches, Rests, Tracks, Words
 from slamcli.slam import rests
 from slamcli.slam.depth_tracking import NO_FRAME_POINTS, FramePoints
 from slamcli.sparse_map.frame import FrameStore
@@ -35,3 +35,12 @@ class KnownMotion:
 
 
 NOTHING_KNOWN = KnownMotion()
+
+
+@dataclass(frozen=True)
+class TrackedRecording:
+    """The frames of a recording, where they stand in a map, and when the camera stood still."""
+
+    frames: FrameStore
+    tracks: Tracks
+    stands_still: Rests = rests.NONE  # the frames of a rest have one pose

@@ -4,6 +4,7 @@ import numpy as np
 
 from slamcli.config.options import TrackConfig
 from slamcli.estimation import camera_pose
+from slamcli.estimation.camera_pose import Ransac
 from slamcli.schema import Words
 from slamcli.slam.place_recognition import PlaceIndex, bow_vector
 from slamcli.sparse_map import landmark_pose
@@ -30,14 +31,8 @@ class Relocalizer:
             if len(row) < self._settings.min_inliers:
                 continue
             x_w = self._sparse_map.lm.xyz[ids]
-            start = camera_pose.ransac_p3p(
-                x_w,
-                frame.xy[row],
-                frame.camera,
-                rng=self._rng,
-                rounds=MORE_ROUNDS * self._settings.ransac_rounds,
-                threshold_px=self._settings.ransac_threshold_px,
-            )
+            ransac = Ransac(MORE_ROUNDS * self._settings.ransac_rounds, self._settings.ransac_threshold_px)
+            start = camera_pose.ransac_p3p(x_w, frame.xy[row], frame.camera, rng=self._rng, ransac=ransac)
             if start is None:
                 continue
             estimate = landmark_pose.refine(start.T_cw, x_w, frame, row)

@@ -1,6 +1,7 @@
 """Guided matching: landmarks projected into a frame meet the features near by."""
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numba import f4, f8, i4, i8, u1, u8
@@ -91,55 +92,66 @@ def search(T_cw: np.ndarray, landmarks: Landmarks, frame: FrameFeatures, limits:
     Returns feature : (L,) int32, -1 where none, each feature at most once; is_visible : (L,) bool, the landmark should have been seen.
     """
     camera = frame.camera
-    intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
     return _search(
         np.ascontiguousarray(T_cw),
-        landmarks.xyz,
-        landmarks.desc,
-        landmarks.direction,
-        landmarks.reach,
-        frame.xy,
-        frame.octave,
-        frame.desc,
-        frame.bucket_start,
-        frame.bucket_rows,
-        intrinsics,
-        camera.width,
-        camera.height,
-        float(landmarks.octave_scale),
-        float(limits.radius_px),
-        int(limits.max_distance),
-        float(limits.ratio),
+        _Sought(landmarks.xyz, landmarks.desc, landmarks.direction, landmarks.reach, float(landmarks.octave_scale)),
+        _Seen(frame.xy, frame.octave, frame.desc, frame.bucket_start, frame.bucket_rows),
+        _Pinhole(camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height),
+        _Limits(float(limits.radius_px), int(limits.max_distance), float(limits.ratio)),
     )
 
 
+class _Sought(NamedTuple):
+    """`Landmarks`, for the kernel."""
+
+    xyz: f8[:, ::1]
+    desc: u8[:, ::1]
+    direction: f8[:, ::1]
+    reach: f8[::1]
+    octave_scale: f8
+
+
+class _Seen(NamedTuple):
+    """`FrameFeatures`, for the kernel."""
+
+    xy: f4[:, ::1]
+    octave: u1[::1]
+    desc: u8[:, ::1]
+    bucket_start: i4[::1]
+    bucket_rows: i4[::1]
+
+
+class _Pinhole(NamedTuple):
+    """`Camera` without its lens, for the kernel."""
+
+    fx: f8
+    fy: f8
+    cx: f8
+    cy: f8
+    width: i8
+    height: i8
+
+
+class _Limits(NamedTuple):
+    """`SearchLimits`, for the kernel."""
+
+    radius_px: f8
+    max_distance: i8
+    ratio: f8
+
+
 @kernel
-def _search(
-    T_cw: f8[:, ::1],
-    xyz: f8[:, ::1],
-    lm_desc: u8[:, ::1],
-    direction: f8[:, ::1],
-    reach: f8[::1],
-    xy: f4[:, ::1],
-    octave: u1[::1],
-    desc: u8[:, ::1],
-    bucket_start: i4[::1],
-    bucket_rows: i4[::1],
-    intrinsics: f8[::1],
-    width: i8,
-    height: i8,
-    octave_scale: f8,
-    radius_px: f8,
-    max_distance: i8,
-    ratio: f8,
-):
+def _search(T_cw: f8[:, ::1], sought: _Sought, seen: _Seen, pinhole: _Pinhole, limits: _Limits):
+    xyz, lm_desc, direction, reach, octave_scale = sought
+    xy, octave, desc, bucket_start, bucket_rows = seen
+    fx, fy, cx, cy, width, height = pinhole
+    radius_px, max_distance, ratio = limits
     n_lm, n = len(xyz), len(xy)
     feature = np.full(n_lm, -1, dtype=np.int32)
     is_visible = np.zeros(n_lm, dtype=np.bool_)
     owner = np.full(n, -1, dtype=np.int32)
     owner_distance = np.full(n, 257, dtype=np.int32)
     columns, rows = -(-width // CELL), -(-height // CELL)
-    fx, fy, cx, cy = intrinsics
     centre_x = -(T_cw[0, 0] * T_cw[0, 3] + T_cw[1, 0] * T_cw[1, 3] + T_cw[2, 0] * T_cw[2, 3])
     centre_y = -(T_cw[0, 1] * T_cw[0, 3] + T_cw[1, 1] * T_cw[1, 3] + T_cw[2, 1] * T_cw[2, 3])
     centre_z = -(T_cw[0, 2] * T_cw[0, 3] + T_cw[1, 2] * T_cw[1, 3] + T_cw[2, 2] * T_cw[2, 3])

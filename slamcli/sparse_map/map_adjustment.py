@@ -8,7 +8,7 @@ import numpy as np
 from slamcli.config.options import SensorConfig
 from slamcli.depth import noise_model
 from slamcli.estimation import bundle_adjustment
-from slamcli.estimation.bundle_problem import Observations
+from slamcli.estimation.bundle_problem import Observations, Problem, Variables
 from slamcli.estimation.measurements import Measurements
 from slamcli.estimation.relative_pose_factors import NO_EDGES, Edges
 from slamcli.geometry import depth_noise, se3
@@ -51,6 +51,10 @@ class Part:
     row: np.ndarray  # (O,) feature row of each observation
     seen: Observations  # by index into kfs and ids
     edges: Edges  # between key frames of kfs
+
+    def start(self, sparse_map: SparseMap) -> Variables:
+        """Return its key frames and landmarks as they stand in the map."""
+        return Variables(sparse_map.T_kw(self.kfs), sparse_map.lm.xyz[self.ids])
 
 
 def gather(sparse_map: SparseMap, moving: np.ndarray, sensor: SensorConfig) -> Part:
@@ -109,16 +113,9 @@ def adjust(
     part = gather(sparse_map, moving, sensor)
     if len(part.row) == 0 and len(part.edges) == 0:
         return None
-    result = bundle_adjustment.adjust(
-        sparse_map.T_kw(part.kfs),
-        sparse_map.lm.xyz[part.ids],
-        part.seen,
-        camera,
-        is_fixed=part.is_fixed,
-        edges=replace(part.edges, information=edge_weight * part.edges.information),
-        max_iterations=max_iterations,
-        tolerance=tolerance,
-    )
+    edges = replace(part.edges, information=edge_weight * part.edges.information)
+    problem = Problem(part.start(sparse_map), part.seen, camera, is_fixed=part.is_fixed, edges=edges)
+    result = bundle_adjustment.adjust(problem, max_iterations=max_iterations, tolerance=tolerance)
     before = sparse_map.kf.T_wk[part.kfs].copy()
     sparse_map.kf.T_wk[part.kfs[~part.is_fixed]] = se3.inverse(result.T_cw[~part.is_fixed])
     sparse_map.lm.xyz[part.ids] = result.x_w

@@ -117,17 +117,16 @@ def find_colours(depths: DepthFrames, poses: Iterable[PosedFrame], sensor: Senso
 def views(depths: DepthFrames, poses: Iterable[PosedFrame], sensor: SensorConfig, option: DensifyConfig) -> Iterator[View]:
     """Read and clean frames, in order, without what moves; one without depth, or that cannot be read, gives no view."""
     is_volume = option.method == "tsdf"
+    nearer = replace(sensor, depth_max=min(sensor.depth_max, option.depth_max))
 
     def look(frame: int, depth: np.ndarray, T_wk: np.ndarray) -> View:
         seen = oriented_points.surface(
             depth,
             depths.camera,
             settings=option,
-            noise=noise_model.reading_noise(sensor),
+            sensor=nearer,
             stride=1 if is_volume else option.stride,
             spacing=0.0 if is_volume else SAMPLES_APART * option.voxel,
-            depth_min=sensor.depth_min,
-            depth_max=min(sensor.depth_max, option.depth_max),
         )
         return View(frame, T_wk, depth, seen, depths.dataset.rgb(frame))
 

@@ -9,7 +9,6 @@ import numpy as np
 from slamcli import artifacts, files
 from slamcli.calibration.self_calibration import Sensing
 from slamcli.config.options import Config
-from slamcli.depth.coarse_images import CoarseImages
 from slamcli.errors import SlamError
 from slamcli.formats.g2o import write_g2o
 from slamcli.schema import LOST, Closures, DepthTimes, FrameTimes, Map, Moving, Recordings, Rests, Timing, Tracks, Words, frame_segments
@@ -18,8 +17,9 @@ from slamcli.slam.common_place import Jury
 from slamcli.slam.depth_tracking import FramePoints
 from slamcli.slam.final_refinement import DepthEdges, Refinement
 from slamcli.slam.loop_candidates import Candidate
-from slamcli.slam.loop_closing import LoopCloser, no_objection
+from slamcli.slam.loop_closing import LoopCloser, Objections, no_objection
 from slamcli.slam.moving_objects import FOR_MAPS
+from slamcli.slam.recording import TrackedRecording
 from slamcli.sparse_map.frame import FrameStore
 from slamcli.sparse_map.sparse_map import SparseMap
 from slamcli.stages import measurements, moving_parts, of_several
@@ -39,13 +39,16 @@ def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
     frames = FrameStore(features, camera, cfg.sensor)
     sparse_map = SparseMap.from_map(features, inputs.load(Map, "optimize"))
 
-    tried = close_loops(inputs, sparse_map, frames, depth, cfg, tools, are_several=when.is_of_several)
+    jury = Jury(sparse_map, depth, frames, cfg.loop)
+    # Segments of one recording are of one place; those of several may not be, so that joining them is to be justified.
+    to_join = jury.objection if when.is_of_several else no_objection
+    tried = close_loops(inputs, sparse_map, frames, Objections(to_join, jury.objection_to_closure), cfg, tools)
     accepted = [c for c in tried if c.is_accepted]
-    if accepted and cfg.loop.final_refinement:
-        depth_edges = DepthEdges(
-            FramePoints(depth, inputs.camera(), cfg.sensor), when, most=cfg.loop.depth_icp_edges, weight=cfg.loop.depth_icp_weight
-        )
-        tracks = look_again(inputs, sparse_map, frames, tracks, depth_edges, cfg, tools)
+    if accepted and cfg.loop.final_refinement:  # now that places seen again coincide
+        points = FramePoints(depth, inputs.camera(), cfg.sensor)
+        edges = DepthEdges(points, when, most=cfg.loop.depth_icp_edges, weight=cfg.loop.depth_icp_weight)
+        by, tracked = Refinement(cfg.track, edges, cfg.loop.iterations), TrackedRecording(frames, tracks, inputs.load(Rests, "track"))
+        tracks, _ = final_refinement.refine_all(sparse_map, tracked, by, progress=tools.progress, workers=tools.workers)
     map_ = map_segments.anchored(main_first(sparse_map.snapshot(), tracks, cfg.loop.main_segment), tracks)
 
     write_pose_graph(out / "posegraph.g2o", map_.T_wk, loop_pose_graph.build(sparse_map, accepted, cfg.loop))
@@ -76,30 +79,13 @@ def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
 
 
 def close_loops(
-    inputs: Inputs, sparse_map: SparseMap, frames: FrameStore, depth: CoarseImages, cfg: Config, tools: Tools, *, are_several: bool
+    inputs: Inputs, sparse_map: SparseMap, frames: FrameStore, objections: Objections, cfg: Config, tools: Tools
 ) -> list[Candidate]:
-    """Join the map's segments and close its loops, if that is wanted; returns all candidates with their fate.
-
-    are_several : whether the segments may be of different places, so that joining them is to be justified
-    """
+    """Join the map's segments and close its loops, if that is wanted; returns all candidates with their fate."""
     if not cfg.loop.enabled or len(sparse_map.kf) <= FEWEST_KEY_FRAMES:
         return []
-    words = inputs.load(Words, "match")
-    jury = Jury(sparse_map, depth, frames, cfg.loop)
-    closer = LoopCloser(
-        sparse_map, words, frames, cfg.loop, tools.rng(), progress=tools.progress,
-        objection=jury.objection if are_several else no_objection, doubt=jury.objection_to_closure,
-    )  # fmt: skip
-    return closer.close_loops()
-
-
-def look_again(
-    inputs: Inputs, sparse_map: SparseMap, frames: FrameStore, tracks: Tracks, depth: DepthEdges, cfg: Config, tools: Tools
-) -> Tracks:
-    """Refine the whole map and every frame, now that places seen again coincide."""
-    by = Refinement(cfg.track, depth, cfg.loop.iterations, inputs.load(Rests, "track"))
-    refined, _ = final_refinement.refine_all(sparse_map, frames, tracks, by, progress=tools.progress, workers=tools.workers)
-    return refined
+    closer = LoopCloser(sparse_map, inputs.load(Words, "match"), frames, cfg.loop, tools.rng(), objections)
+    return closer.close_loops(tools.progress)
 
 
 def find_moving(

@@ -8,7 +8,7 @@ import numpy as np
 from slamcli.config.options import Config, OctreeConfig, SensorConfig
 from slamcli.dense import change_detection
 from slamcli.dense.occupancy import OccupancyMap, Scan
-from slamcli.depth import noise_model, oriented_points
+from slamcli.depth import oriented_points
 from slamcli.formats import octomap
 from slamcli.geometry import octree, se3
 from slamcli.geometry.algebra import product
@@ -74,11 +74,9 @@ def scans(depths: DepthFrames, poses: Iterable[PosedFrame], sensor: SensorConfig
             depth,
             depths.camera,
             settings=option,
-            noise=noise_model.reading_noise(sensor),
+            sensor=sensor,
             stride=option.stride,
             spacing=RAYS_APART * option.resolution,
-            depth_min=sensor.depth_min,
-            depth_max=sensor.depth_max,
         )
         return Scan(se3.transform(T_lk, seen.xyz_c.astype(np.float64)), T_lk[:3, 3], frame)
 

@@ -14,6 +14,7 @@ from slamcli.schema import Features, FrameTimes, Map, Moving, Rests, Timing, Tra
 from slamcli.slam import calibration_doubt, doubt, final_refinement, map_segments, rests
 from slamcli.slam.depth_tracking import NO_FRAME_POINTS, FramePoints
 from slamcli.slam.final_refinement import DepthEdges, Refinement
+from slamcli.slam.recording import TrackedRecording
 from slamcli.sparse_map import map_adjustment
 from slamcli.sparse_map.frame import FrameStore
 from slamcli.sparse_map.sparse_map import SparseMap
@@ -78,8 +79,8 @@ def refine(
     sparse_map.features = self_calibration.correct(features, given, sensing)
     frames = FrameStore(sparse_map.features, sensing.camera, cfg.sensor)
     depth = DepthEdges(extracted.points, sensing.timing, most=cfg.optimize.depth_icp_edges)
-    by = Refinement(cfg.track, depth, cfg.optimize.iterations, extracted.stands_still)
-    tracks, result = final_refinement.refine_all(sparse_map, frames, tracks, by, progress=tools.progress, workers=tools.workers)
+    by, tracked = Refinement(cfg.track, depth, cfg.optimize.iterations), TrackedRecording(frames, tracks, extracted.stands_still)
+    tracks, result = final_refinement.refine_all(sparse_map, tracked, by, progress=tools.progress, workers=tools.workers)
     summary = {} if result is None else {"cost": [*cost, result.cost[-1]], "outliers": int((~result.is_inlier).sum())}
     return tracks, sensing, summary
 

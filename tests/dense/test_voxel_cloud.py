@@ -4,16 +4,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from slamcli.config.options import DensifyConfig
+from slamcli.config.options import DensifyConfig, SensorConfig
 from slamcli.dense import outlier_removal
 from slamcli.dense.voxel_cloud import VoxelCloud
 from slamcli.depth import oriented_points
 from slamcli.depth.oriented_points import Surface
 from slamcli.geometry import se3
 from slamcli.geometry.camera import Camera
-from slamcli.geometry.depth_noise import DepthNoise
 
-NOISE = DepthNoise(0.0012, 0.0019)
 CAMERA = Camera(160, 120, 130.0, 131.0, 79.2, 60.3)
 LENS = Camera(160, 120, 130.0, 131.0, 79.2, 60.3, 0.26, -0.95, -0.005, 0.003, 1.16)
 
@@ -30,9 +28,8 @@ def noisy(depth: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 def see(depth: np.ndarray, camera: Camera = CAMERA, *, stride: int = 1, spacing: float = 0.0, depth_max: float = 6.0, **more) -> Surface:
-    return oriented_points.surface(
-        depth, camera, settings=DensifyConfig(**more), noise=NOISE, stride=stride, spacing=spacing, depth_min=0.3, depth_max=depth_max
-    )
+    sensor = SensorConfig(depth_max=depth_max)
+    return oriented_points.surface(depth, camera, settings=DensifyConfig(**more), sensor=sensor, stride=stride, spacing=spacing)
 
 
 def unit(*vector: float) -> np.ndarray:

@@ -15,14 +15,14 @@ from slamcli.geometry import se3
 
 
 def full_system(scene: Scene, T: np.ndarray, x: np.ndarray, limits=HUBER) -> tuple[np.ndarray, np.ndarray]:
-    return naive.bundle_normal_equations(T, x, *scene.problem[2:], limits)
+    return naive.bundle_normal_equations(T, x, *scene.given[2:], limits)
 
 
 # --- kernels against their slow twins
 
 
 def linearized(scene: Scene) -> Problem:
-    problem = Problem(*scene.problem, np.zeros(len(scene.T_cw), dtype=bool))
+    problem = scene.problem(is_fixed=np.zeros(len(scene.T_cw), dtype=bool))
     problem.linearize(problem.start)
     return problem
 
@@ -48,14 +48,14 @@ def test_blocks_equal_numerical_derivatives():
 def test_cost_equals_its_slow_twin():
     scene = drive(4, 60, share=0.6)
     for loss in (HUBER, LEAST_SQUARES):
-        fast = Problem(*scene.problem, scene.first, loss=loss).cost(Variables(scene.T_cw, scene.x_w))
-        np.testing.assert_allclose(fast, naive.bundle_cost(*scene.problem, loss), rtol=1e-12)
+        fast = scene.problem(loss=loss).cost(Variables(scene.T_cw, scene.x_w))
+        np.testing.assert_allclose(fast, naive.bundle_cost(*scene.given, loss), rtol=1e-12)
 
 
 @pytest.mark.parametrize("is_fixed", [[True, False, False, False], [False, True, True, False], [True] * 4])
 def test_a_step_solves_the_damped_normal_equations(is_fixed):
     scene = drive(4, 40, share=0.7)
-    problem = Problem(*scene.problem, np.array(is_fixed))
+    problem = scene.problem(is_fixed=np.array(is_fixed))
     damping = 1e-3
     problem.linearize(problem.start)
     (T, x), expected = problem.step(problem.start, damping)
@@ -114,7 +114,7 @@ def test_cost_does_not_feel_where_the_world_stands():
     scene = drive(5, 80)
     G = se3.exp(np.array([3.0, -2.0, 1.0, 0.4, 1.0, -0.7]))
     moved = replace(scene, T_cw=scene.T_cw @ se3.inverse(G), x_w=se3.transform(G, scene.x_w))
-    a, b = (bundle_adjustment.adjust(*s.problem, is_fixed=s.first, max_iterations=30, tolerance=1e-12) for s in (scene, moved))
+    a, b = (bundle_adjustment.adjust(s.problem(), max_iterations=30, tolerance=1e-12) for s in (scene, moved))
     np.testing.assert_allclose(a.cost[0], b.cost[0], rtol=1e-9)
     np.testing.assert_allclose(a.cost[-1], b.cost[-1], rtol=1e-9)
     np.testing.assert_allclose(b.T_cw @ G, a.T_cw, atol=1e-6)
@@ -135,7 +135,7 @@ def test_the_reduced_system_has_six_free_directions_when_nothing_is_fixed():
 def test_without_a_fixed_key_frame_the_same_cost_is_reached():
     scene = drive(6, 100)
     nothing = np.zeros(6, dtype=bool)
-    tied, free = (bundle_adjustment.adjust(*scene.problem, is_fixed=f, max_iterations=40, tolerance=1e-12) for f in (scene.first, nothing))
+    tied, free = (bundle_adjustment.adjust(scene.problem(is_fixed=f), max_iterations=40, tolerance=1e-12) for f in (scene.first, nothing))
     np.testing.assert_allclose(free.cost[-1], tied.cost[-1], rtol=1e-7)
 
 
@@ -144,7 +144,7 @@ def test_fixed_key_frames_and_the_input_stay_bit_for_bit():
     names = ("T_cw", "x_w", "obs_kf", "obs_lm", "xy", "depth", "sigma_px", "sigma_z")
     before = {name: np.array(getattr(scene, name)) for name in names}
     is_fixed = np.array([True, False, True, False, False, True])
-    result = bundle_adjustment.adjust(*scene.problem, is_fixed=is_fixed)
+    result = bundle_adjustment.adjust(scene.problem(is_fixed=is_fixed))
     assert result.T_cw[is_fixed].tobytes() == scene.T_cw[is_fixed].tobytes()
     assert (result.T_cw[~is_fixed] != scene.T_cw[~is_fixed]).any(axis=(1, 2)).all()
     for name, value in before.items():
@@ -153,14 +153,14 @@ def test_fixed_key_frames_and_the_input_stay_bit_for_bit():
 
 def test_the_cost_never_rises_and_same_input_gives_same_bytes():
     scene = drive(10, 300, start=3.0)
-    a, b = (bundle_adjustment.adjust(*scene.problem, is_fixed=scene.first, max_iterations=20) for _ in range(2))
+    a, b = (bundle_adjustment.adjust(scene.problem(), max_iterations=20) for _ in range(2))
     assert (np.diff(a.cost) < 0).all() and a.is_converged
     assert a.T_cw.tobytes() == b.T_cw.tobytes() and a.x_w.tobytes() == b.x_w.tobytes() and a.cost == b.cost
 
 
 def test_rotations_stay_rotations():
     scene = drive(6, 100, start=4.0)
-    T = bundle_adjustment.adjust(*scene.problem, is_fixed=scene.first, max_iterations=50).T_cw
+    T = bundle_adjustment.adjust(scene.problem(), max_iterations=50).T_cw
     np.testing.assert_allclose(T[:, :3, :3] @ T[:, :3, :3].transpose(0, 2, 1), np.broadcast_to(np.eye(3), (6, 3, 3)), atol=1e-12)
 
 
@@ -169,7 +169,7 @@ def test_rotations_stay_rotations():
 
 def test_without_noise_the_truth_comes_back():
     scene = drive(8, 200, noise=0.0)
-    result = bundle_adjustment.adjust(*scene.problem, is_fixed=scene.first, max_iterations=30, tolerance=1e-14)
+    result = bundle_adjustment.adjust(scene.problem(), max_iterations=30, tolerance=1e-14)
     is_seen = np.bincount(scene.obs_lm, minlength=200) > 0
     assert result.cost[-1] < 1e-10 * result.cost[0]
     assert np.abs(pose_error(result.T_cw, scene.T_true)).max() < 1e-6
@@ -181,7 +181,7 @@ def test_with_noise_the_cost_and_the_errors_are_what_statistics_say():
     chi2_pose, reduced = [], []
     for seed in range(12):
         scene = drive(6, 150, seed=seed)
-        result = bundle_adjustment.adjust(*scene.problem, is_fixed=scene.first, loss=LEAST_SQUARES, max_iterations=20, tolerance=1e-9)
+        result = bundle_adjustment.adjust(scene.problem(loss=LEAST_SQUARES), max_iterations=20, tolerance=1e-9)
         n_seen = (np.bincount(scene.obs_lm, minlength=150) > 0).sum()
         freedom = 2 * len(scene.xy) + np.isfinite(scene.depth).sum() - 6 * 5 - 3 * n_seen
         reduced.append(result.cost[-1] / freedom)
@@ -193,7 +193,7 @@ def test_with_noise_the_cost_and_the_errors_are_what_statistics_say():
 
 def test_the_inverse_of_the_reduced_system_is_the_covariance_of_the_key_frames():
     scene = drive(4, 60, noise=0.5, share=0.8)
-    result = bundle_adjustment.adjust(*scene.problem, is_fixed=scene.first, max_iterations=20, tolerance=1e-10)
+    result = bundle_adjustment.adjust(scene.problem(), max_iterations=20, tolerance=1e-10)
     H, _ = full_system(scene, result.T_cw, result.x_w, LEAST_SQUARES)
     used = np.concatenate([np.zeros(6, dtype=bool), np.ones(18, dtype=bool), np.repeat(np.bincount(scene.obs_lm, minlength=60) > 0, 3)])
     whole = np.zeros_like(H)
@@ -209,9 +209,9 @@ def test_outliers_are_found_and_hardly_harm():
     xy = scene.xy.copy()
     xy[is_bad] += rng.uniform(15, 80, (is_bad.sum(), 2)) * rng.choice([-1, 1], (is_bad.sum(), 2))
     dirty = replace(scene, xy=xy)
-    clean = bundle_adjustment.adjust(*scene.problem, is_fixed=scene.first, max_iterations=20)
-    result = bundle_adjustment.adjust(*dirty.problem, is_fixed=scene.first, max_iterations=20)
-    careless = bundle_adjustment.adjust(*dirty.problem, is_fixed=scene.first, max_iterations=20, loss=LEAST_SQUARES)
+    clean = bundle_adjustment.adjust(scene.problem(), max_iterations=20)
+    result = bundle_adjustment.adjust(dirty.problem(), max_iterations=20)
+    careless = bundle_adjustment.adjust(dirty.problem(loss=LEAST_SQUARES), max_iterations=20)
     error = [np.linalg.norm(pose_error(r.T_cw, scene.T_true)[:, :3], axis=1).mean() for r in (clean, result, careless)]
     assert (result.is_inlier & is_bad).sum() < 0.05 * is_bad.sum()
     assert (result.is_inlier & ~is_bad).sum() > 0.85 * (~is_bad).sum()
@@ -226,8 +226,8 @@ def test_outliers_are_found_and_hardly_harm():
 def test_long_drives_take_the_same_road_as_short_ones(n_kf):
     """A band of 60 key frames, and one of 320 in which few share landmarks, against the dense system."""
     scene = drive(n_kf, 6 * n_kf, seed=6, share=0.5, step=0.4, start=0.3)
-    result = bundle_adjustment.adjust(*scene.problem, is_fixed=scene.first, max_iterations=4, tolerance=0.0)
-    problem = Problem(*scene.problem, scene.first)
+    result = bundle_adjustment.adjust(scene.problem(), max_iterations=4, tolerance=0.0)
+    problem = scene.problem()
     assert problem.system.form == "band"
     problem.system.form = "dense"
     found = bundle_adjustment.minimize(problem, max_iterations=4, tolerance=0.0)
@@ -244,8 +244,8 @@ def test_g2o_reaches_the_same_cost(tmp_path: Path):
     scene = drive(6, 150, seed=7)
     rng = np.random.default_rng(0)
     scene.xy[rng.random(len(scene.xy)) < 0.05] += 20.0
-    ours = bundle_adjustment.adjust(*scene.problem, is_fixed=scene.first, max_iterations=60, tolerance=1e-13)
-    peer = G2oBundle(*scene.problem, is_fixed=scene.first, limits=HUBER, folder=tmp_path)
+    ours = bundle_adjustment.adjust(scene.problem(), max_iterations=60, tolerance=1e-13)
+    peer = G2oBundle(*scene.given, is_fixed=scene.first, limits=HUBER, folder=tmp_path)
     np.testing.assert_allclose(peer.cost(), ours.cost[0], rtol=1e-9)
     peer.optimize(200)
     np.testing.assert_allclose(peer.cost(), ours.cost[-1], rtol=1e-6)

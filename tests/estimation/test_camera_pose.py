@@ -6,6 +6,7 @@ import pytest
 
 from slamcli.estimation import camera_pose, minimal_solvers, pose_kernels
 from slamcli.estimation.bundle_problem import Observations
+from slamcli.estimation.camera_pose import Ransac, SeenPoints
 from slamcli.estimation.measurements import Measurements
 from slamcli.estimation.robust_loss import HUBER, LEAST_SQUARES, Huber
 from slamcli.geometry import se3
@@ -119,7 +120,8 @@ def test_ransac_ranks_as_its_slow_twin():
     T = np.ascontiguousarray(se3.exp(0.02 * rng.normal(size=(40, 6))) @ T_cw)[:, :3].copy()
     T[3] = np.nan
     ray, is_inlier = (xy - [CAMERA.cx, CAMERA.cy]) / [CAMERA.fx, CAMERA.fy], np.zeros(60, dtype=bool)
-    best, done = pose_kernels.rank(T, T, x_w, ray, x_w, ray, False, CAMERA.fx, CAMERA.fy, np.full(60, 16.0), 4, 1.0 - 1e-15, is_inlier)
+    tested, rule = pose_kernels.Hypotheses(T, x_w, ray), Ransac(threshold_px=4.0, confidence=1.0 - 1e-15).agreement(CAMERA, 4)
+    best, done = pose_kernels.rank(tested, tested, False, rule, is_inlier)
     assert best == naive.ranked(T, x_w, xy, CAMERA, 4.0) and done <= 40
     error = np.linalg.norm(CAMERA.project(se3.transform(np.vstack([T[best], [0, 0, 0, 1]]), x_w)) - xy, axis=1)
     np.testing.assert_array_equal(is_inlier, error < 4.0)
@@ -145,7 +147,8 @@ def test_ransac_needs_enough_pairs(n):
     rng = np.random.default_rng(8)
     assert camera_pose.ransac_p3p(np.ones((n, 3)), np.ones((n, 2)), CAMERA, rng=rng) is None
     n = min(n, 2)
-    assert camera_pose.ransac_rigid(np.ones((n, 3)), np.ones((n, 3)), np.ones((n, 2)), np.ones((n, 2)), CAMERA, rng=rng) is None
+    seen = SeenPoints(np.ones((n, 3)), np.ones((n, 2)))
+    assert camera_pose.ransac_rigid(seen, seen, CAMERA, rng=rng) is None
 
 
 def test_ransac_survives_nan_and_points_all_in_one_place():
@@ -168,7 +171,7 @@ def test_rigid_ransac_finds_the_motion_and_checks_both_images():
     x_a, x_b = x_a * (1 + 0.005 * rng.normal(size=(300, 1))), x_b * (1 + 0.005 * rng.normal(size=(300, 1)))
     xy_a[:60] += 30.0  # wrong in a alone
     xy_b[60:120] += 30.0  # wrong in b alone
-    found = camera_pose.ransac_rigid(x_a, x_b, xy_a, xy_b, CAMERA, rng=rng, rounds=200, threshold_px=6.0)
+    found = camera_pose.ransac_rigid(SeenPoints(x_a, xy_a), SeenPoints(x_b, xy_b), CAMERA, rng=rng, ransac=Ransac(200, 6.0))
     assert not found.is_inlier[:120].any() and found.is_inlier[120:].mean() > 0.7
     assert 1e-6 < np.linalg.norm(distance(found.T_ba, T_ba)) < 0.1
 
@@ -180,11 +183,11 @@ def test_normal_equations_equal_numerical_derivatives():
     rng = np.random.default_rng(11)
     T_cw, x_w, xy, depth, sigma_px, sigma_z, _ = view(rng, 40, outliers=0.2)
     T = se3.exp(0.01 * rng.normal(size=6)) @ T_cw
-    H, b, chi2 = np.zeros((6, 6)), np.zeros(6), np.empty(40)
+    found = pose_kernels.System(np.zeros((6, 6)), np.zeros(6), np.empty(40))
     intrinsics = np.array([CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy])
-    cost = pose_kernels.normal_equations(
-        T, x_w, xy, depth, 1 / sigma_px, 1 / sigma_z, np.ones(40, dtype=bool), intrinsics, *HUBER, True, chi2, H, b
-    )  # fmt: skip
+    seen = pose_kernels.Seen(x_w, xy, depth, 1 / sigma_px, 1 / sigma_z)
+    cost = pose_kernels.normal_equations(T, seen, np.ones(40, dtype=bool), intrinsics, HUBER, found)
+    H, b, chi2 = found
     one = (T[None], x_w, Observations(np.zeros(40, dtype=int), np.arange(40), xy, depth, sigma_px, sigma_z), CAMERA, HUBER)
     H_slow, b_slow = naive.bundle_normal_equations(*one)
     np.testing.assert_allclose(cost, naive.bundle_cost(*one), rtol=1e-12)

@@ -4,10 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from bundle_scene import CAMERA, covariance, drive, pose_error
+from bundle_scene import Scene, covariance, drive, pose_error
 
 from slamcli.estimation import bundle_adjustment
-from slamcli.estimation.bundle_problem import Observations, Problem
 from slamcli.estimation.relative_pose_factors import NO_EDGES, Edges, EdgeTerms, residuals
 from slamcli.estimation.robust_loss import CHI2_95_6DOF, HUBER, LEAST_SQUARES
 from slamcli.geometry import se3
@@ -25,11 +24,9 @@ def chain(T_true: np.ndarray, rng: np.random.Generator, *, noise: float = 1.0, r
     return Edges(kf, T_ij, np.broadcast_to(np.linalg.inv(root @ root.T), (len(kf), 6, 6)).copy())
 
 
-def blank(T_cw: np.ndarray) -> tuple:
-    """Return a bundle problem without any landmark."""
-    nothing = np.empty(0)
-    seen = Observations(nothing.astype(int), nothing.astype(int), np.empty((0, 2)), nothing, nothing, nothing)
-    return T_cw, np.empty((0, 3)), seen, CAMERA
+def blank(scene: Scene) -> Scene:
+    """Leave all landmarks out."""
+    return replace(scene.keep(np.arange(0)), x_w=np.empty((0, 3)))
 
 
 def numerical_gradient(terms: EdgeTerms, T_cw: np.ndarray, robust: bool, step: float = 1e-6) -> np.ndarray:
@@ -92,10 +89,10 @@ def test_blocks_equal_the_derivatives_of_the_residuals():
 def test_edges_alone_bring_the_truth_back_and_leave_the_gauge_free():
     scene = drive(8, 20, start=2.0)
     edges = chain(scene.T_true, np.random.default_rng(2), noise=0.0)
-    tied = bundle_adjustment.adjust(*blank(scene.T_cw), is_fixed=scene.first, edges=edges, max_iterations=30, tolerance=1e-14)
+    tied = bundle_adjustment.adjust(blank(scene).problem(edges=edges), max_iterations=30, tolerance=1e-14)
     assert np.abs(pose_error(tied.T_cw, scene.T_true)).max() < 1e-6
     G = se3.exp(np.array([1.0, -2.0, 0.5, 0.3, -0.4, 0.9]))
-    moved = bundle_adjustment.adjust(*blank(scene.T_cw @ G), is_fixed=scene.first, edges=edges, max_iterations=30, tolerance=1e-14)
+    moved = bundle_adjustment.adjust(blank(replace(scene, T_cw=scene.T_cw @ G)).problem(edges=edges), max_iterations=30, tolerance=1e-14)
     np.testing.assert_allclose(moved.T_cw @ se3.inverse(G), tied.T_cw, atol=1e-6)
 
 
@@ -105,7 +102,7 @@ def test_chi2_and_covariance_are_what_statistics_say():
         scene = drive(6, 20, seed=seed, start=0.2)
         edges = chain(scene.T_true, np.random.default_rng(seed))
         bare = scene.keep(np.arange(0))
-        result = bundle_adjustment.adjust(*bare.problem, is_fixed=scene.first, edges=edges, loss=LEAST_SQUARES, max_iterations=20)
+        result = bundle_adjustment.adjust(bare.problem(edges=edges, loss=LEAST_SQUARES), max_iterations=20)
         e = pose_error(result.T_cw, scene.T_true)[1:].ravel()
         chi2.append(e @ np.linalg.solve(covariance(bare, result, range(1, 6), edges), e))
         cost.append(result.cost[-1] / (6 * len(edges) - 30))
@@ -118,10 +115,9 @@ def test_edges_and_landmarks_add_up():
     scene = drive(6, 120, seed=3)
     without = scene.keep(np.flatnonzero(scene.obs_kf != 4))
     edges = chain(scene.T_true, np.random.default_rng(3))
-    options = {"is_fixed": scene.first, "max_iterations": 20}
-    both, landmarks = (bundle_adjustment.adjust(*without.problem, **options, **more) for more in ({"edges": edges}, {}))
+    both, landmarks = (bundle_adjustment.adjust(without.problem(edges=e), max_iterations=20) for e in (edges, NO_EDGES))
     bare = scene.keep(np.arange(0))
-    only = bundle_adjustment.adjust(*bare.problem, edges=edges, **options)
+    only = bundle_adjustment.adjust(bare.problem(edges=edges), max_iterations=20)
     joint, a, b = (
         np.trace(covariance(s, r, [2], e)) for s, r, e in ((without, both, edges), (without, landmarks, NO_EDGES), (bare, only, edges))
     )
@@ -137,7 +133,7 @@ def test_a_false_edge_bends_less_than_its_error():
     T_ij[5] = se3.exp(np.array([0.5, 0.0, 0.2, 0.1, 0.0, 0.0])) @ T_ij[5]
     wrong = replace(edges, T_ij=T_ij)
     right, robust, trusting = (
-        bundle_adjustment.adjust(*scene.problem, is_fixed=scene.first, edges=e, loss=r, max_iterations=30)
+        bundle_adjustment.adjust(scene.problem(edges=e, loss=r), max_iterations=30)
         for e, r in ((edges, HUBER), (wrong, HUBER), (wrong, LEAST_SQUARES))
     )
     error = [np.linalg.norm(pose_error(r.T_cw, scene.T_true)[:, :3], axis=1).max() for r in (right, robust, trusting)]
@@ -150,8 +146,8 @@ def test_without_edges_nothing_changes_and_many_key_frames_take_the_same_road(n_
     scene = drive(n_kf, 6 * n_kf, seed=5, share=0.5, step=0.4, start=0.3)
     far = Edges(np.array([[n_kf - 1, 0]]), (scene.T_true[n_kf - 1] @ se3.inverse(scene.T_true[0]))[None], np.diag(SIGMA**-2.0)[None])
     for edges in (far, chain(scene.T_true, np.random.default_rng(5))):
-        result = bundle_adjustment.adjust(*scene.problem, is_fixed=scene.first, edges=edges, max_iterations=4, tolerance=0.0)
-        problem = Problem(*scene.problem, scene.first, edges)
+        result = bundle_adjustment.adjust(scene.problem(edges=edges), max_iterations=4, tolerance=0.0)
+        problem = scene.problem(edges=edges)
         problem.system.form = "dense"
         cost = bundle_adjustment.minimize(problem, max_iterations=4, tolerance=0.0).cost
         np.testing.assert_allclose(result.cost, cost, rtol=1e-9)
@@ -163,9 +159,7 @@ def test_g2o_reaches_the_same_cost():
 
     scene = drive(10, 20, seed=6, start=1.0)
     edges = chain(scene.T_true, np.random.default_rng(6), reach=3)
-    ours = bundle_adjustment.adjust(
-        *blank(scene.T_cw), is_fixed=scene.first, edges=edges, loss=LEAST_SQUARES, max_iterations=50, tolerance=1e-13
-    )
+    ours = bundle_adjustment.adjust(blank(scene).problem(edges=edges, loss=LEAST_SQUARES), max_iterations=50, tolerance=1e-13)
     peer = pose_graph.optimize(se3.inverse(scene.T_cw), edges, is_fixed=scene.first)
     np.testing.assert_allclose(ours.cost[-1], peer.cost, rtol=1e-3)  # g2o minimizes a residual that differs in the second order
     np.testing.assert_allclose(se3.inverse(peer.T_wk), ours.T_cw, atol=2e-4)

@@ -10,7 +10,7 @@ from slamcli.estimation.robust_loss import LEAST_SQUARES
 
 
 def problem_of(scene: Scene) -> Problem:
-    return Problem(*scene.problem, scene.first, loss=LEAST_SQUARES)
+    return scene.problem(loss=LEAST_SQUARES)
 
 
 def columns_of(problem: Problem, rng: np.random.Generator, n: int = 2) -> np.ndarray:
@@ -58,7 +58,7 @@ def test_the_estimate_solves_the_normal_equations_of_all_unknowns_together():
     assert problem.is_inlier(chi2).all()  # none is left out as an outlier
     found = shared_parameters.estimate(problem, given, prior=np.zeros(2), prior_sigma=np.full(2, 1e3))
 
-    H, b = naive.bundle_normal_equations(*scene.problem, LEAST_SQUARES)
+    H, b = naive.bundle_normal_equations(*scene.given, LEAST_SQUARES)
     C = np.stack([minus_gradient(problem, columns[:, :, g]) - minus_gradient(problem, 0.0) for g in range(2)], axis=1)
     weight = problem.measured[:, [3, 3, 4]]
     J = (columns * weight[:, :, None]).reshape(-1, 2)

@@ -10,7 +10,7 @@ import pytest
 from boxroom import KINECT, READING, kinect_noise, look_along
 
 from slamcli import artifacts
-from slamcli.config.options import Config, DensifyConfig, GroundConfig, OctreeConfig, SurfaceConfig
+from slamcli.config.options import Config, DensifyConfig, GroundConfig, OctreeConfig, SensorConfig, SurfaceConfig
 from slamcli.dense.occupancy import log_odds
 from slamcli.depth import oriented_points
 from slamcli.formats import cloud, octomap
@@ -105,9 +105,7 @@ def octreed(folder: Path, n: int = 1, **options):
 
 
 def cleaned(kind: type[SurfaceConfig], depth: np.ndarray, **options) -> oriented_points.Surface:
-    return oriented_points.surface(
-        depth, KINECT, settings=kind(**options), noise=READING, stride=1, spacing=0.0, depth_min=0.3, depth_max=8.0
-    )
+    return oriented_points.surface(depth, KINECT, settings=kind(**options), sensor=SensorConfig(), stride=1, spacing=0.0)
 
 
 @pytest.mark.shows("densify.edge", "octree.edge")

@@ -142,8 +142,8 @@ def test_landmarks_of_so_many_neighbours_take_part(scene: Scene) -> None:
     assert alone < 0.9 * together
 
 
-def closer(scene: Scene, sparse_map: SparseMap, *, progress=lambda items, label: items, **options) -> LoopCloser:
-    return LoopCloser(sparse_map, scene.words, scene.frames(SENSOR), LoopConfig(**options), np.random.default_rng(0), progress=progress)
+def closer(scene: Scene, sparse_map: SparseMap, **options) -> LoopCloser:
+    return LoopCloser(sparse_map, scene.words, scene.frames(SENSOR), LoopConfig(**options), np.random.default_rng(0))
 
 
 @pytest.mark.shows("loop.fuse_max_distance")
@@ -172,7 +172,7 @@ def test_the_pose_graph_has_the_edges_asked_for(scene: Scene) -> None:
 def closed(scene: Scene, *, drift: float = 0.002, **options) -> tuple[list[Candidate], SparseMap, int]:
     """Close the loop; returns all candidates, the map, and how many passes over it were made."""
     sparse_map, passes = mapped(scene, drift=drift), []
-    tried = closer(scene, sparse_map, progress=lambda items, label: passes.append(label) or items, **options).close_loops()
+    tried = closer(scene, sparse_map, **options).close_loops(lambda items, label: passes.append(label) or items)
     return tried, sparse_map, len(passes)
 
 
@@ -240,9 +240,9 @@ def refined(monkeypatch: pytest.MonkeyPatch) -> list[final_refinement.Refinement
     """Note what the second look at everything is asked for, instead of taking it."""
     asked: list[final_refinement.Refinement] = []
 
-    def refine_all(sparse_map, frames, tracks, by, **_):
+    def refine_all(sparse_map, tracked, by, **_):
         asked.append(by)
-        return tracks, None
+        return tracked.tracks, None
 
     monkeypatch.setattr(final_refinement, "refine_all", refine_all)
     return asked

@@ -11,6 +11,7 @@ from scenes import ape
 
 from slamcli.calibration.self_calibration import Sensing
 from slamcli.config.options import LoopConfig, OptimizeConfig, SensorConfig, TrackConfig
+from slamcli.console import silent
 from slamcli.depth import icp
 from slamcli.depth.coarse_images import CoarseImages
 from slamcli.geometry import se3
@@ -18,7 +19,7 @@ from slamcli.schema import KEY_FRAME, LOST, ON_DEPTH, Features, Matches, Timing,
 from slamcli.slam import final_refinement, loop_pose_graph
 from slamcli.slam.depth_tracking import DepthAligner, FramePoints
 from slamcli.slam.final_refinement import DepthEdges, Refinement
-from slamcli.slam.recording import Recording
+from slamcli.slam.recording import Recording, TrackedRecording
 from slamcli.slam.tracker import Tracker
 from slamcli.sparse_map import map_adjustment
 from slamcli.sparse_map.frame import FrameStore
@@ -202,15 +203,15 @@ def test_a_second_look_joins_key_frames_that_see_the_same_and_moves_them_to_wher
     store = FrameStore(sparse_map.features, KINECT, SENSOR)
     timing = Timing(np.array(0.0), np.array(0.0), np.array(0.0), np.zeros((n, 6)))
     depth = DepthEdges(FramePoints(coded(corner().of(frames)), KINECT, SENSOR), timing, most=most)
-    by, progress = Refinement(TrackConfig(), depth, iterations=20), lambda items, *_: items
-    after, result = final_refinement.refine_all(sparse_map, store, tracks, by, progress=progress)
+    by = Refinement(TrackConfig(), depth, iterations=20)
+    after, result = final_refinement.refine_all(sparse_map, TrackedRecording(store, tracks), by, progress=silent)
     assert len(sparse_map.edge) == {0: 0, 1: 3, 6: 6}[most]
     assert (after.state == KEY_FRAME).all() and result.cost[-1] < result.cost[0]
     true = turn(14)[frames]
     e = se3.log((se3.inverse(sparse_map.kf.T_wk[0]) @ sparse_map.kf.T_wk) @ se3.inverse(se3.inverse(true[0]) @ true))
     error = np.linalg.norm(e[1:, :3], axis=1).mean()
     assert 1e-4 < error < 0.01 if most else error > 0.02
-    final_refinement.refine_all(sparse_map, store, after, by, progress=progress)
+    final_refinement.refine_all(sparse_map, TrackedRecording(store, after), by, progress=silent)
     assert len(sparse_map.edge) == {0: 0, 1: 3, 6: 6}[most], "no pair is joined twice"
 
 

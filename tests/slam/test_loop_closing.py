@@ -7,12 +7,14 @@ import pytest
 from scenes import ape, observe, orbit, room_points
 
 from slamcli.config.options import LoopConfig, SensorConfig, TrackConfig
+from slamcli.console import silent
 from slamcli.geometry import se3
 from slamcli.schema import LOST, frame_poses
 from slamcli.slam import final_refinement, frame_refinement, loop_candidates, loop_pose_graph, loop_verification
 from slamcli.slam.loop_candidates import Candidate, Claims
 from slamcli.slam.loop_closing import LoopCloser
 from slamcli.slam.place_recognition import PlaceIndex
+from slamcli.slam.recording import TrackedRecording
 from slamcli.slam.tracker import Tracker
 from slamcli.sparse_map.frame import FrameStore
 from slamcli.sparse_map.sparse_map import SparseMap
@@ -75,8 +77,8 @@ def test_closing_takes_the_drift_out(turn):
     true = scene.T_gc[map_.kf_frame]
     before = ape(sparse_map.kf.T_wk, true)
     n_landmarks = int(sparse_map.lm.is_alive.sum())
-    closer = LoopCloser(sparse_map, scene.words, scene.frames(SENSOR), SETTINGS, np.random.default_rng(1), progress=lambda items, *_: items)
-    tried = closer.close_loops()
+    closer = LoopCloser(sparse_map, scene.words, scene.frames(SENSOR), SETTINGS, np.random.default_rng(1))
+    tried = closer.close_loops(silent)
     after = ape(sparse_map.kf.T_wk, true)
     assert any(c.is_accepted for c in tried) and [(c.kf_i, c.kf_j) for c in tried] == sorted(closer.fate)
     assert 50 < n_landmarks - sparse_map.lm.is_alive.sum() < 0.5 * n_landmarks, "what both sides see is one landmark now"
@@ -120,7 +122,7 @@ def test_final_refinement_finds_lost_frames_and_keeps_the_rest(turn):
     tracks = replace(tracks, **{name: getattr(tracks, name).copy() for name in ("state", "ref_kf", "T_kc")})
     tracks.state[40:44], tracks.ref_kf[40:44], tracks.T_kc[40:44] = LOST, -1, np.nan
     sparse_map = SparseMap.from_map(scene.features, map_)
-    after = frame_refinement.refine_frames(sparse_map, scene.frames(SENSOR), tracks, TrackConfig(), lambda items, *_: items)
+    after = frame_refinement.refine_frames(sparse_map, TrackedRecording(scene.frames(SENSOR), tracks), TrackConfig(), silent)
     assert (after.state != LOST).all()
     error = [ape(frame_poses(t, map_), scene.T_gc) for t in (tracks, after)]
     assert 1e-4 < error[1] < error[0] + 0.001
@@ -131,7 +133,7 @@ def test_final_refinement_finds_the_same_with_any_number_of_threads(turn):
     found = []
     for workers in (1, 2, 4):
         sparse_map = SparseMap.from_map(scene.features, map_)
-        look = (sparse_map, scene.frames(SENSOR), tracks, TrackConfig(), lambda items, *_: items)
+        look = (sparse_map, TrackedRecording(scene.frames(SENSOR), tracks), TrackConfig(), silent)
         found.append(frame_refinement.refine_frames(*look, workers=workers))
     assert (found[0].T_kc != tracks.T_kc).any()
     for other in found[1:]:
@@ -144,7 +146,7 @@ def test_frames_of_one_key_frame_are_refined_together_whenever_they_were(turn, m
     back_and_forth = replace(tracks, ref_kf=np.arange(len(tracks.ref_kf), dtype=np.int32) % 2 * tracks.ref_kf)
     asked, covisible = [], SparseMap.covisible
     monkeypatch.setattr(SparseMap, "covisible", lambda self, kf: (asked.append(kf), covisible(self, kf))[1])
-    look = (SparseMap.from_map(scene.features, map_), scene.frames(SENSOR), back_and_forth, TrackConfig(), lambda items, *_: items)
+    look = (SparseMap.from_map(scene.features, map_), TrackedRecording(scene.frames(SENSOR), back_and_forth), TrackConfig(), silent)
     frame_refinement.refine_frames(*look)
     n_frames = np.bincount(back_and_forth.ref_kf)
     assert n_frames[0] > 1
@@ -156,7 +158,7 @@ def test_frames_that_were_refined_are_let_go_of(turn, monkeypatch):
     released: list[FrameStore] = []
     monkeypatch.setattr(FrameStore, "release", lambda self: released.append(self))
     monkeypatch.setattr(frame_refinement, "KEPT", 25)
-    look = (SparseMap.from_map(scene.features, map_), scene.frames(SENSOR), tracks, TrackConfig(), lambda items, *_: items)
+    look = (SparseMap.from_map(scene.features, map_), TrackedRecording(scene.frames(SENSOR), tracks), TrackConfig(), silent)
     frame_refinement.refine_frames(*look)
     assert len(released) == len(tracks.state) // 25
 
@@ -169,7 +171,7 @@ def test_final_refinement_matches_key_frames_again_and_the_world_stays_where_it_
     noise[0] = np.eye(4)
     sparse_map.kf.T_wk[:] = sparse_map.kf.T_wk @ noise
     shaken = sparse_map.kf.T_wk.copy()
-    found = frame_refinement.refine_frames(sparse_map, scene.frames(SENSOR), tracks, TrackConfig(), lambda items, *_: items)
+    found = frame_refinement.refine_frames(sparse_map, TrackedRecording(scene.frames(SENSOR), tracks), TrackConfig(), silent)
     assert (sparse_map.kf.T_wk == shaken).all(), "to refine frames leaves the map as it is"
     seen, landmarks = frame_poses(found, sparse_map.snapshot()), sparse_map.snapshot().lm_xyz
     after = final_refinement.move_key_frames(sparse_map, found)
@@ -189,8 +191,8 @@ def test_a_key_frame_that_depth_held_keeps_its_pose(turn):
     most = int(tracks.n_inliers.max())
     found = [
         frame_refinement.refine_frames(
-            SparseMap.from_map(scene.features, map_), scene.frames(SENSOR), tracks, replace(TrackConfig(), depth_icp_below=least),
-            lambda items, *_: items,
+            SparseMap.from_map(scene.features, map_), TrackedRecording(scene.frames(SENSOR), tracks),
+            replace(TrackConfig(), depth_icp_below=least), silent,
         )
         for least in (10 * most, 0)
     ]  # fmt: skip

@@ -9,6 +9,7 @@ from plain_maps import plain_map, share, words_in
 from scenes import CAMERA
 
 from slamcli.config.options import LoopConfig, SensorConfig
+from slamcli.console import silent
 from slamcli.geometry import se3
 from slamcli.slam import loop_closing
 from slamcli.slam.loop_candidates import Candidate
@@ -71,7 +72,7 @@ class Rounds:
         monkeypatch.setattr(map_adjustment, "adjust", lambda *_, **__: None)
         self.closer = LoopCloser(
             self.map, words_in([[0]] * N), FrameStore(self.map.features, CAMERA, SensorConfig()), LoopConfig(**settings),
-            np.random.default_rng(0), progress=lambda items, _: items, objection=objection,
+            np.random.default_rng(0), loop_closing.Objections(to_join=objection),
         )  # fmt: skip
 
     def fate(self) -> dict[Pair, str]:
@@ -80,13 +81,13 @@ class Rounds:
 
 def test_one_closure_stands_for_those_around_it(monkeypatch):
     rounds = Rounds(monkeypatch, alike=[(50, 2), (45, 7), (59, 9), (44, 2), (56, 2)], closure_spacing=5, rounds=1)
-    rounds.closer.close_loops()
+    rounds.closer.close_loops(silent)
     assert rounds.tried == [(50, 2), (59, 9), (44, 2), (56, 2)]
 
 
 def test_a_candidate_that_was_refused_stands_for_none(monkeypatch):
     rounds = Rounds(monkeypatch, alike=[(50, 2), (51, 2), (52, 2)], refused=((50, 2),), closure_spacing=5, rounds=1)
-    tried = rounds.closer.close_loops()
+    tried = rounds.closer.close_loops(silent)
     assert rounds.tried == [(50, 2), (51, 2)]
     assert [(c.kf_i, c.kf_j, c.is_accepted) for c in tried] == [(50, 2, False), (51, 2, True)]
     assert rounds.fate() == {(50, 2): "refused", (51, 2): ""}
@@ -94,7 +95,7 @@ def test_a_candidate_that_was_refused_stands_for_none(monkeypatch):
 
 def test_what_the_graph_contradicts_is_dropped_and_words_do_not_name_it_again(monkeypatch):
     rounds = Rounds(monkeypatch, alike=[(59, 0), (30, 5), (31, 5)], near=[(32, 5)], false=((30, 5), (31, 5)), closure_spacing=3, rounds=3)
-    rounds.closer.close_loops()
+    rounds.closer.close_loops(silent)
     assert rounds.tried == [(59, 0), (30, 5), (32, 5)], "in the second round the poses of now name (32, 5), the words (31, 5)"
     fate = rounds.fate()
     assert fate[59, 0] == "" and "contradicts it (chi2 " in fate[30, 5] and fate[32, 5] == ""
@@ -105,7 +106,7 @@ def test_what_the_graph_contradicts_is_dropped_and_words_do_not_name_it_again(mo
 def test_what_had_too_few_matches_is_not_asked_again_and_what_the_map_may_have_changed_is(monkeypatch, n_matches: int, times: int):
     alike, false = [(59, 0), (30, 5), (45, 20)], ((45, 20),)  # what the graph contradicts asks for a second round
     rounds = Rounds(monkeypatch, alike=alike, false=false, refused=((30, 5),), matches_of_refused=n_matches, min_matches=20, rounds=3)
-    rounds.closer.close_loops()
+    rounds.closer.close_loops(silent)
     assert rounds.tried.count((30, 5)) == times and rounds.fate()[30, 5] == "refused"
 
 
@@ -114,7 +115,7 @@ def test_rounds_end_where_closures_move_nothing(monkeypatch, is_refined: bool, s
     rounds, adjusted = Rounds(monkeypatch, alike=[(59, 0), (30, 5)], refused=((30, 5),), rounds=3, final_refinement=is_refined), []
     monkeypatch.setattr(map_adjustment, "adjust", lambda *_, **how: adjusted.append(how))
     rounds.truth[59, 0, 3] += shift  # where the closure says that it is
-    rounds.closer.close_loops()
+    rounds.closer.close_loops(silent)
     assert rounds.tried.count((30, 5)) == n_rounds and len(adjusted) == n_adjusted
     assert {kf for kf, _ in rounds.fused} >= {59, 0}
 
@@ -122,14 +123,14 @@ def test_rounds_end_where_closures_move_nothing(monkeypatch, is_refined: bool, s
 def test_where_the_graph_contradicts_all_the_map_stays_and_no_further_round_is_made(monkeypatch):
     rounds = Rounds(monkeypatch, alike=[(30, 5)], false=((30, 5),), rounds=3)
     before = rounds.map.kf.T_wk.copy()
-    rounds.closer.close_loops()
+    rounds.closer.close_loops(silent)
     np.testing.assert_array_equal(rounds.map.kf.T_wk, before)
     assert rounds.tried == [(30, 5)] and rounds.fused == []
 
 
 def test_after_a_round_that_closed_nothing_no_other_is_made(monkeypatch):
     rounds = Rounds(monkeypatch, alike=[(50, 2)], refused=((50, 2),), rounds=3)
-    assert [c.reason for c in rounds.closer.close_loops()] == ["refused"] and rounds.tried == [(50, 2)]
+    assert [c.reason for c in rounds.closer.close_loops(silent)] == ["refused"] and rounds.tried == [(50, 2)]
 
 
 HALVES = [0] * 30 + [1] * 30
@@ -163,7 +164,7 @@ def test_what_says_otherwise_than_a_join_is_tried_again_as_a_loop(monkeypatch):
     rounds = Rounds(monkeypatch, alike=pairs, false=((35, 15),), n_inliers={(35, 15): 60}, segment=HALVES, closure_spacing=0, rounds=1)
     rounds.closer.join_segments()
     assert rounds.fate() == {(50, 2): "", (40, 9): ""}
-    rounds.closer.close_loops()
+    rounds.closer.close_loops(silent)
     assert rounds.tried[3:] == [(35, 15)] and "contradicts" in rounds.fate()[35, 15]
 
 
@@ -205,7 +206,7 @@ def test_each_side_of_a_closure_is_looked_for_on_the_other(monkeypatch, most: in
 def test_what_was_refused_is_tried_again_on_the_corrected_map(monkeypatch):
     rounds = Rounds(monkeypatch, alike=[(50, 2), (30, 20)], refused=((50, 2),), rounds=2)
     rounds.truth[30, 0, 3] += 0.02  # where the closure says that it is
-    rounds.closer.close_loops()
+    rounds.closer.close_loops(silent)
     assert rounds.tried == [(50, 2), (30, 20), (50, 2)]
 
 
@@ -214,5 +215,5 @@ def test_the_map_comes_to_its_optimum_once(monkeypatch, is_refined, tolerance):
     rounds, given = Rounds(monkeypatch, alike=[(59, 0)], final_refinement=is_refined), []
     monkeypatch.setattr(map_adjustment, "adjust", lambda *_, **how: given.append(how["tolerance"]))
     rounds.truth[59, 0, 3] += 0.02  # where the closure says that it is
-    rounds.closer.close_loops()
+    rounds.closer.close_loops(silent)
     assert given == [tolerance]

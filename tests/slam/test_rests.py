@@ -5,10 +5,11 @@ import pytest
 from scenes import CAMERA, Scene, ape, observe, room_points, sweep
 
 from slamcli.config.options import SensorConfig, TrackConfig
+from slamcli.console import silent
 from slamcli.geometry import se3
 from slamcli.schema import KEY_FRAME, LOST, Features, Rests, frame_poses
 from slamcli.slam import frame_refinement, rests
-from slamcli.slam.recording import KnownMotion
+from slamcli.slam.recording import KnownMotion, TrackedRecording
 from slamcli.slam.tracker import Tracker
 from slamcli.sparse_map.sparse_map import SparseMap
 
@@ -97,9 +98,8 @@ def test_the_final_refinement_gives_a_rest_one_pose_better_than_a_single_frame_h
     for name, spans in (("one pose", stands_still), ("each its own", rests.NONE)):
         tracker = track(scene, stands_still)
         sparse_map, tracks = SparseMap.from_map(scene.features, tracker.map()), tracker.tracks()
-        after = frame_refinement.refine_frames(
-            sparse_map, scene.frames(SENSOR), tracks, TrackConfig(), lambda items, *_: items, stands_still=spans
-        )
+        tracked = TrackedRecording(scene.frames(SENSOR), tracks, spans)
+        after = frame_refinement.refine_frames(sparse_map, tracked, TrackConfig(), silent)
         T_wc = frame_poses(after, sparse_map.snapshot())[FIRST : LAST + 1]
         error[name] = np.linalg.norm(T_wc[:, :3, 3] - T_wc[:, :3, 3].mean(axis=0), axis=1).max()
     assert error["one pose"] < 1e-9 and 1e-4 < error["each its own"] < 0.01
