@@ -246,23 +246,27 @@ class Run:
             raise SlamError(f"{self.path}: the cloud has no normals, which walls are found by")
         return make_floor_plan(self.grid(), xyz, normal, wall_height=wall_height, door_width=door_width, least_area=LEAST_AREA)
 
-    def ape(self, stage: str | None = None) -> "Ape":
-        """Measure the absolute pose error after a stage (None: the last there is); SlamError without ground truth."""
+    def ape(self, stage: str | None = None, *, truth: "Trajectory | None" = None) -> "Ape":
+        """Measure the absolute pose error after a stage (None: the last there is); SlamError without ground truth.
+
+        truth : poses to compare with instead of the recording's true ones, such as another run's trajectory
+        """
         from slamcli.evaluation import trajectory_error
 
         stage = stage or trajectory_error.last_stage(self.directory)
-        truth = trajectory_error.ground_truth(self.directory)
+        truth = trajectory_error.ground_truth(self.directory) if truth is None else truth
         return trajectory_error.ape(
             self.trajectory(stage), truth, n_frames=trajectory_error.frame_count(self.directory), name=self.name, stage=stage
         )
 
-    def rpe(self, stage: str | None = None, *, seconds: float | None = 1.0) -> "Rpe":
-        """Measure the relative pose error over an interval, or from one frame to the next where that is None."""
+    def rpe(self, stage: str | None = None, *, seconds: float | None = 1.0, truth: "Trajectory | None" = None) -> "Rpe":
+        """Measure the relative pose error over an interval, or from one frame to the next where that is None; `truth` as for `ape`."""
         from slamcli.evaluation import trajectory_error
         from slamcli.schema import FrameTimes
 
         stage = stage or trajectory_error.last_stage(self.directory)
-        truth, stamp = trajectory_error.ground_truth(self.directory), self.directory.load(FrameTimes, stage).stamp
+        truth = trajectory_error.ground_truth(self.directory) if truth is None else truth
+        stamp = self.directory.load(FrameTimes, stage).stamp
         return trajectory_error.rpe(self.trajectory(stage), truth, frame_stamp=stamp, name=self.name, stage=stage, seconds=seconds)
 
     def verdict(self) -> "Verdict | None":

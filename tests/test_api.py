@@ -13,6 +13,7 @@ from slamcli.config.options import Config
 from slamcli.errors import SlamError
 from slamcli.formats.trajectory import read_tum
 from slamcli.geometry import se3
+from slamcli.schema import Trajectory
 from slamcli.stages import NAMES
 
 
@@ -94,6 +95,15 @@ def test_errors_against_the_truth(room_run: Path) -> None:
     assert ape.stage == "loop" and rpe.stage == "track" and rpe.unit == "frame"
     moved = se3.transform(ape.T_gw, run.trajectory().T_wc[:, :3, 3])
     np.testing.assert_allclose(moved[: len(ape.x_aligned)], ape.x_aligned, atol=1e-6)
+
+
+def test_errors_against_poses_of_ones_own_choice(room_run: Path) -> None:
+    run = slamcli.open_run(room_run)
+    own, other = run.trajectory(), run.trajectory("track")
+    ape = run.ape(truth=Trajectory(own.stamp[::2], own.T_wc[::2]))
+    assert ape.rmse < 1e-9 and ape.n_poses == len(own.stamp) and len(ape.stamp) == len(own.stamp[::2])
+    assert run.ape(truth=other).rmse > 1e-6, "loop moved the poses that track found"
+    assert run.rpe(truth=own).translation.max() < 1e-9
 
 
 def test_a_stage_alone_and_a_report(room_run: Path, here: Path) -> None:

@@ -30,6 +30,7 @@ APE_COLUMNS = {
     "n_frames": ("frames", "d"),
     "lost": ("lost", "d"),
     "coverage": ("coverage", ".1%"),
+    "n_matched": ("compared", "d"),
     "scale": ("scale", ".4f"),
     "rmse_scaled": ("RMSE scaled [m]", ".4f"),
     "doubtful": ("doubtful", "d"),

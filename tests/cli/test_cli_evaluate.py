@@ -119,6 +119,14 @@ def test_other_systems_stand_beside(slamcli: Command, made: finished.Finished, t
     assert missing.exit_code == 1 and "none.txt" in missing.stderr
 
 
+def test_a_truth_of_half_the_recording_is_told_beside_the_coverage(slamcli: Command, made: finished.Finished, tmp_path: Path) -> None:
+    half = Trajectory(made.truth.stamp[:40], made.truth.T_wc[:40])
+    write_tum(tmp_path / "half.txt", half)
+    table = slamcli("eval", "ape", "-r", made.run, "--truth", tmp_path / "half.txt", "--style", "csv").stdout
+    (row,) = csv.DictReader(io.StringIO(table))
+    assert 30 < int(row["n_matched"]) <= 40 and float(row["coverage"]) == pytest.approx(84 / 90)
+
+
 def test_rpe(slamcli: Command, made: finished.Finished) -> None:
     figures = json.loads(slamcli("eval", "rpe", "-r", made.run, "--json").stdout)
     assert (figures["unit"], figures["delta"], figures["per_frame"]["unit"]) == ("s", 1.0, "frame")
