@@ -1,7 +1,8 @@
 """Does the map bear out the calibration? What the recording says of numbers that were given as certain.
 
 Two looks that do not depend on one another. A map at its optimum says by how much each number of the camera would have to change to
-make its residuals least, and how sure that is (`estimation/shared_parameters.py`); a sound one says zero for all of them. And points seen
+make its residuals least, and how sure that is (`estimation/shared_parameters.py`); a sound one says zero for all of them. Times that the map
+was given are asked anew with them: a principal point that is wrong looks like rows read one after the other. And points seen
 from two places keep their distances from one another: under a wrong focal length the same points, measured in depth and pixels in two
 parts of the image, are no rigid body. That needs no pose, so it also holds where a map is ruined.
 """
@@ -13,6 +14,7 @@ import numpy as np
 from numba import f8
 
 from slamcli.calibration import self_calibration
+from slamcli.calibration.measurement_derivatives import TIMES
 from slamcli.calibration.self_calibration import Sensing
 from slamcli.config.options import SensorConfig
 from slamcli.depth import noise_model
@@ -23,8 +25,8 @@ from slamcli.jit.kernel import kernel
 from slamcli.sparse_map.sparse_map import SparseMap
 
 # Standard deviations of what is looked for: wide, as whatever the map says is to be heard. Shares of the focal length and of the picture's
-# width; k1 as it is; [1/m].
-PRIOR_FOCAL, PRIOR_CENTRE, PRIOR_LENS, PRIOR_SHIFT, PRIOR_DISPARITY = 0.3, 0.1, 0.3, 0.05, 0.05
+# width; k1 as it is; [1/m]. Of times around 0 [s], as of cameras that read their rows one after the other.
+PRIOR_FOCAL, PRIOR_CENTRE, PRIOR_LENS, PRIOR_SHIFT, PRIOR_DISPARITY, PRIOR_TIME = 0.3, 0.1, 0.3, 0.05, 0.05, 0.02
 SHARED = 25  # landmarks with depth that two key frames share, to be compared
 NEXT = 5  # later key frames that each is compared with
 MOST_PAIRS = 60  # of key frames, evenly spread
@@ -38,13 +40,11 @@ class Deviation:
     """By how much the map would have a number changed."""
 
     value: float
-    sigma: float
-    explained: float  # share of the chi2 of all residuals that goes with it
+    sigma: float  # as the map's own residuals say: they may be smaller or larger than the noise model has them
 
-    @property
-    def certainty(self) -> float:
-        """Return the value in standard deviations."""
-        return abs(self.value) / self.sigma
+    def beyond(self, tolerated: float) -> float:
+        """Return by how many standard deviations the value exceeds a size that is tolerated; at most 0 where it does not."""
+        return (abs(self.value) - tolerated) / self.sigma
 
 
 @dataclass(frozen=True)
@@ -74,12 +74,13 @@ def deviations(sparse_map: SparseMap, now: Sensing, sensor: SensorConfig) -> dic
     share = {"focal": PRIOR_FOCAL, "cx": PRIOR_CENTRE, "cy": PRIOR_CENTRE, "k1": PRIOR_LENS, "shift_x": PRIOR_SHIFT, "shift_y": PRIOR_SHIFT}
     # What an error of disparity bends is not to be taken for a lens.
     prior = {name: share[name] * unit[name] for name in share} | {"inverse_depth_offset": PRIOR_DISPARITY}
+    prior |= {name: PRIOR_TIME for name in TIMES if name in now.sigma}
     asked = self_calibration.deviations(sparse_map, now, sensor, prior=prior)
     if asked is None:
         return {}
     shares = zip(prior, asked.found.value, asked.found.sigma, strict=True)
     return {
-        name: Deviation(float(value) / unit[name], float(sigma) / unit[name], float((value / sigma) ** 2 / max(asked.chi2, 1e-9)))
+        name: Deviation(float(value) / unit[name], float(sigma) * asked.unit_sigma / unit[name])
         for name, value, sigma in shares
         if name in unit
     }

@@ -14,7 +14,7 @@ from slamcli.calibration import rolling_shutter
 from slamcli.calibration.measurement_derivatives import TIMES, Predictions, current_value, derivative
 from slamcli.config.options import OptimizeConfig, SensorConfig
 from slamcli.estimation import shared_parameters
-from slamcli.estimation.bundle_problem import Problem
+from slamcli.estimation.bundle_problem import INV_SIGMA_Z, Problem
 from slamcli.estimation.robust_loss import LEAST_SQUARES
 from slamcli.estimation.shared_parameters import Shared
 from slamcli.geometry.camera import Camera
@@ -24,6 +24,7 @@ from slamcli.sparse_map.sparse_map import SparseMap
 
 SIGNIFICANT = 3.0  # standard deviations
 MOST_KEY_FRAMES = 80  # whose landmarks are asked what they would have changed
+POSE, POINT = 6, 3  # unknowns of a key frame and of a landmark
 ROWS_AT_ONCE = 1 << 18  # features recalibrated together: the intermediate results of a long recording would fill the memory
 
 
@@ -106,27 +107,40 @@ class Deviations:
     """By how much a map would have numbers changed."""
 
     found: Shared  # in the order of the prior
-    chi2: float  # of the observations that were used
+    unit_sigma: float  # of the residuals, in what is believed of them: `found.sigma` is to be multiplied by it
 
 
 def deviations(sparse_map: SparseMap, now: Sensing, sensor: SensorConfig, *, prior: dict[str, float]) -> Deviations | None:
     """Find by how much an adjusted map would have numbers changed; None where the map is not determined.
 
-    prior : standard deviations around what is known now: of fields of Timing or Camera, and of what `measurement_derivatives` knows besides
+    prior : standard deviations: of fields of Camera, and of what `measurement_derivatives` knows besides, around what is known now; of fields
+        of Timing around 0, as a time that the map was given may have taken the place of what is asked for
     Only landmarks count, and in a long recording those of a stretch of MOST_KEY_FRAMES: edges were measured with the numbers in question.
     """
     n = len(sparse_map.kf)
     first = max(0, (n - MOST_KEY_FRAMES) // 2)
     part = map_adjustment.gather(sparse_map, np.arange(n, dtype=np.int32), sensor)
-    asked = _ask(sparse_map, map_adjustment.landmarks_alone(part, first, first + MOST_KEY_FRAMES), now, prior)
+    part = map_adjustment.landmarks_alone(part, first, first + MOST_KEY_FRAMES)
+    asked = _ask(sparse_map, part, now, prior)
     if asked is None:
         return None
     problem, columns, _ = asked
-    found = shared_parameters.estimate(problem, columns, prior=np.zeros(len(prior)), prior_sigma=np.array(list(prior.values())))
-    if found is None:
-        return None
-    chi2 = problem.chi2(problem.start)
-    return Deviations(found, float(chi2[problem.is_inlier(chi2)].sum()))
+    centre = np.array([-float(getattr(now.timing, name)) if name in TIMES else 0.0 for name in prior])
+    found = shared_parameters.estimate(problem, columns, prior=centre, prior_sigma=np.array(list(prior.values())))
+    return None if found is None else Deviations(found, _unit_sigma(problem, part.seen.lm))
+
+
+def _unit_sigma(problem: Problem, lm: np.ndarray) -> float:
+    """Estimate the standard deviation of unit weight: of all residuals of inliers, in the standard deviations that they were given.
+
+    lm : (O,) landmark of each observation, in the order given
+    """
+    chi2 = problem.in_given_order(problem.chi2(problem.start))
+    is_used = problem.in_given_order(problem.is_inlier(problem.chi2(problem.start)))
+    has_depth = problem.in_given_order(problem.measured[:, INV_SIGMA_Z] > 0.0)
+    n_residuals = 2 * int(is_used.sum()) + int((is_used & has_depth).sum())
+    n_unknowns = problem.hold.size * POSE + len(np.unique(lm[is_used])) * POINT
+    return float(np.sqrt(chi2[is_used].sum() / max(n_residuals - n_unknowns, 1)))
 
 
 def _ask(

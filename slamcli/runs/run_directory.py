@@ -10,6 +10,7 @@ import logging
 import os
 import shlex
 import shutil
+import stat
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import UTC, datetime
@@ -463,5 +464,9 @@ def refuse_inside(path: Path, *, own: str = "") -> None:
 
 def outputs(folder: Path) -> dict[str, dict[str, Any]]:
     """List a stage's files with size and digest, by name."""
-    paths = sorted(path for path in folder.rglob("*") if path.is_file() and path.name != "stage.json")
-    return {path.relative_to(folder).as_posix(): {"bytes": path.stat().st_size, "sha256": files.sha256(path)} for path in paths}
+    found = {path: path.stat() for path in sorted(folder.rglob("*")) if path.name != "stage.json"}
+    return {
+        path.relative_to(folder).as_posix(): {"bytes": status.st_size, "sha256": files.sha256(path, status)}
+        for path, status in found.items()
+        if stat.S_ISREG(status.st_mode)
+    }

@@ -37,9 +37,9 @@ APART = frozenset(
     }
 )
 
-# Both begin with the end of the line before, a letter that is looked for four times as quickly as the place after it.
-FOR_TYPE_CHECKERS = re.compile(r"\n( *)if TYPE_CHECKING:\n(?:\1 +.*\n|\n)+")
-IMPORT = re.compile(r"\n *(?:from +(slamcli[\w.]*) +import +(\([^)]*\)|.*)|import +(slamcli[\w.]*))")
+# From the beginning of a line on.
+FOR_TYPE_CHECKERS = re.compile(r"( *)if TYPE_CHECKING:\n(?:\1 +.*\n|\n)+")
+IMPORT = re.compile(r" *(?:from +(slamcli[\w.]*) +import +(\([^)]*\)|.*)|import +(slamcli[\w.]*))")
 
 
 @functools.cache
@@ -91,18 +91,30 @@ def reachable(start: list[str]) -> set[str]:
 @functools.cache
 def imported(file: str) -> frozenset[str]:
     """List the files of this package that a file imports; what only type checkers see is left out."""
-    return frozenset(path for module in _modules(_content(file).decode()) for path in _files_of(module))
+    return frozenset().union(*map(_files_of, _modules(_content(file).decode())))
 
 
 def _modules(text: str) -> Iterator[str]:
     """Return the dotted names that import statements mention; of ``from a import b`` both a and a.b, which may be no module."""
-    for statement in IMPORT.finditer(FOR_TYPE_CHECKERS.sub("\n", f"\n{text}")):
+    unseen = [block.span() for block in _at_lines_with("if TYPE_CHECKING:", FOR_TYPE_CHECKERS, text)]
+    for statement in _at_lines_with("slamcli", IMPORT, text):
+        if any(first <= statement.start() < end for first, end in unseen):
+            continue
         home, names, plain = statement.groups()
         if plain:
             yield plain
         else:
             yield home
             yield from (f"{home}.{name.split()[0]}" for name in names.split("#")[0].strip("() \n").split(",") if name.strip())
+
+
+def _at_lines_with(word: str, pattern: re.Pattern[str], text: str) -> Iterator[re.Match[str]]:
+    """Match a pattern from the beginning of each line that holds a word: to search all lines for it takes ten times as long."""
+    place = text.find(word)
+    while place >= 0:
+        if found := pattern.match(text, text.rfind("\n", 0, place) + 1):
+            yield found
+        place = text.find(word, max(place + 1, found.end() if found else 0))
 
 
 @functools.cache
@@ -122,7 +134,8 @@ def _files() -> frozenset[str]:
 
 @functools.cache
 def _content(file: str) -> bytes:
-    return (PACKAGE / file).read_bytes()
+    with open(f"{PACKAGE}/{file}", "rb", buffering=0) as source:  # `Path.read_bytes` takes twice as long
+        return source.read()
 
 
 @functools.cache

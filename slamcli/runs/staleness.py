@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 from slamcli.config.options import Config
@@ -34,8 +34,8 @@ def declared(stage: Stage, config: Config) -> dict[str, Any]:
     values: dict[str, Any] = {"seed": config.seed}
     for name in stage.config:
         section = getattr(config, name)
-        values[name] = dict(section) if isinstance(section, dict) else asdict(section)
-    return json.loads(json.dumps(values))  # tuples become lists, as they are when read back
+        values[name] = section if isinstance(section, dict) else vars(section)
+    return json.loads(json.dumps(values))  # copied, and tuples become lists, as they are when read back
 
 
 def named_files(stage: Stage, config: Config) -> dict[str, str]:

@@ -8,11 +8,15 @@ import pytest
 from scene_run import Run
 from scenes import CAMERA, Scene, observe, orbit, room_points
 
-from slamcli.calibration import plausibility
+from slamcli.calibration import plausibility, rolling_shutter, self_calibration
 from slamcli.calibration.plausibility import Deviation, Rigidity, Seen
+from slamcli.calibration.self_calibration import Sensing
 from slamcli.config.options import SensorConfig
 from slamcli.geometry import se3
+from slamcli.schema import Timing
 from slamcli.slam import calibration_doubt
+from slamcli.sparse_map import map_adjustment
+from slamcli.sparse_map.sparse_map import SparseMap
 from slamcli.stages import optimize, track
 
 WRONG = {  # what the calibration says, the finding, and the words with the right number
@@ -20,7 +24,7 @@ WRONG = {  # what the calibration says, the finding, and the words with the righ
     "half": ({"fx": 260.0, "fy": 260.0}, "focal_length", "fx = 5"),
     "double": ({"fx": 1040.0, "fy": 1040.0}, "focal_length", "fx = 5"),
     "longer": ({"fx": 590.0, "fy": 590.0}, "focal_length", "fx = 5"),
-    "aside": ({"cx": 360.0}, "principal_point", "(33"),
+    "aside": ({"cx": 360.0}, "principal_point", "(32"),
     "bent": ({"k1": 0.4}, "lens", "k1 = "),
 }
 
@@ -46,6 +50,42 @@ def test_the_wrong_number_is_named(scene: Scene, case: str, tmp_path: Path) -> N
     assert [one["name"] for one in found] == ([name] if name else [])
     assert all(one["is_grave"] and words in one["text"] for one in found)
     assert [one["text"] for one in found] == [text for text in run.warnings if "does not fit" in text]
+
+
+def deviations_of(scene: Scene, run: Run, *, readout: float = 0.0, sigma: dict[str, float], sensor: SensorConfig) -> dict[str, Deviation]:
+    """Adjust the tracked map as if the camera read its rows within `readout`, and ask it for its camera."""
+    tracks, map_ = run.result("track")
+    twist = rolling_shutter.frame_twists(scene.features.stamp, tracks, map_)
+    now = Sensing(CAMERA, Timing(np.array(readout), np.array(0.0), depth_delay=np.array(0.0), twist=twist), sigma)
+    sparse_map = SparseMap.from_map(scene.features, map_)
+    sparse_map.features = self_calibration.correct(scene.features, CAMERA, now)
+    map_adjustment.adjust(sparse_map, np.arange(len(sparse_map.kf), dtype=np.int32), CAMERA, sensor, max_iterations=20)
+    return plausibility.deviations(sparse_map, now, sensor)
+
+
+def test_a_readout_that_the_map_was_given_takes_the_place_of_no_principal_point(scene: Scene, tmp_path: Path) -> None:
+    """A readout of 30 ms, of a camera that has none, moves the principal point by 2 % of the width unless it is asked anew as well."""
+    run = Run(scene, tmp_path)
+    run.stage(track)
+    right = deviations_of(scene, run, sigma={}, sensor=run.cfg.sensor)
+    alone = deviations_of(scene, run, readout=0.03, sigma={}, sensor=run.cfg.sensor)
+    together = deviations_of(scene, run, readout=0.03, sigma={"readout": 0.02}, sensor=run.cfg.sensor)
+    assert abs(alone["cx"].value - right["cx"].value) > 0.02
+    assert abs(together["cx"].value - right["cx"].value) < 0.003
+
+
+def test_how_sure_a_deviation_is_follows_from_the_residuals_and_not_from_what_was_believed_of_them(scene: Scene, tmp_path: Path) -> None:
+    run = Run(scene, tmp_path)
+    run.stage(track)
+    believed = run.cfg.sensor
+    twice = replace(
+        believed,
+        pixel_noise=2 * believed.pixel_noise,
+        depth_noise_base=2 * believed.depth_noise_base,
+        depth_noise_quadratic=2 * believed.depth_noise_quadratic,
+    )
+    one, other = (deviations_of(scene, run, sigma={}, sensor=sensor) for sensor in (believed, twice))
+    assert all(0.8 < other[name].sigma / one[name].sigma < 1.25 for name in ("focal", "cx", "cy", "k1"))
 
 
 @pytest.mark.parametrize("factor", [0.5, 0.9, 1.0, 1.3, 2.0])
@@ -76,18 +116,12 @@ def test_too_few_points_say_nothing() -> None:
 
 
 def test_the_greatest_fault_is_named_alone_and_small_or_unsure_ones_never() -> None:
-    sure, strong = {"sigma": 0.001, "explained": 0.3}, {"sigma": 0.001, "explained": 0.5}
-    found = {
-        "focal": Deviation(0.05, **sure),
-        "cx": Deviation(-0.05, **strong),
-        "cy": Deviation(0.0, **sure),
-        "k1": Deviation(0.2, 0.1, 0.5),
-    }
+    found = {"focal": Deviation(0.07, 0.001), "cx": Deviation(-0.05, 0.001), "cy": Deviation(0.0, 0.001), "k1": Deviation(0.3, 0.1)}
     assert [one.name for one in calibration_doubt.about(found, None, CAMERA)] == ["principal_point"]
-    assert calibration_doubt.about({"focal": Deviation(0.05, 0.001, 0.03)}, None, CAMERA) == []
-    assert calibration_doubt.about({"focal": Deviation(0.01, **sure)}, None, CAMERA) == []
+    assert calibration_doubt.about({"focal": Deviation(0.07, 0.004)}, None, CAMERA) == []
+    assert calibration_doubt.about({"focal": Deviation(0.05, 0.001)}, None, CAMERA) == []
     assert calibration_doubt.about({}, Rigidity(0.7, 1.1, 20), CAMERA) == []
     assert [one.name for one in calibration_doubt.about(found, Rigidity(0.5, 2.0, 20), CAMERA)] == ["focal_length"]
-    assert [one.name for one in calibration_doubt.about(dict.fromkeys(("shift_x", "shift_y"), Deviation(0.02, **sure)), None, CAMERA)] == [
+    assert [one.name for one in calibration_doubt.about(dict.fromkeys(("shift_x", "shift_y"), Deviation(0.02, 0.001)), None, CAMERA)] == [
         "depth_shift"
     ]
