@@ -7,11 +7,14 @@ import tomllib
 from pathlib import Path
 
 import pytest
+from click.testing import CliRunner
 
 import slamcli
 from slamcli.cli.main import cli
 from slamcli.config import toml
 from slamcli.config.options import Config
+from slamcli.datasets import READERS
+from slamcli.formats import TRAJECTORY_FORMATS, cloud, mesh
 from slamcli.geometry.camera import Camera
 
 ROOT = Path(__file__).parents[1]
@@ -56,6 +59,30 @@ def test_the_camera_file_in_the_documents_is_whole_and_right() -> None:
     assert (camera.width, camera.height, camera.depth_scale) == (640, 480, 1000.0)
 
 
+def test_every_layout_that_opens_has_a_row() -> None:
+    page = (ROOT / "docs" / "recordings.md").read_text(encoding="utf-8")
+    for reader in READERS:
+        assert re.search(r"[\w-]{3,}", reader.title).group() in page, f"a row for {reader.title}"
+
+
+def test_every_ending_that_is_written_is_told() -> None:
+    rows = {
+        words[1].strip(): line
+        for line in (ROOT / "docs" / "exports.md").read_text(encoding="utf-8").splitlines()
+        if len(words := line.split("|")) > 3
+    }
+    trajectory = [ending for endings in TRAJECTORY_FORMATS.values() for ending in endings]
+    for what, endings in {
+        "trajectory": trajectory,
+        "cloud": cloud.WRITERS,
+        "surface": mesh.WRITERS,
+        "textured surface": mesh.TEXTURE_WRITERS,
+    }.items():
+        assert all(f"`{ending}`" in rows[what] for ending in endings), what
+    told = CliRunner().invoke(cli, ["export-trajectory", "--help"]).output
+    assert all(ending in told for ending in trajectory)
+
+
 def names_in(body: list[ast.stmt]) -> dict[str, ast.stmt]:
     return {node.name: node for node in body if isinstance(node, ast.FunctionDef | ast.ClassDef)}
 
@@ -89,4 +116,4 @@ def test_the_glossary_explains_every_count_of_every_stage(room_run: Path) -> Non
         explained.setdefault(stage, set()).update(row[1].split(", "))
     for name, summary in slamcli.open_run(room_run).summary().items():
         counted = {count.replace("_", " ") for count in summary} - {"frames"}
-        assert counted <= explained[name], f"{name}: {sorted(counted - explained[name])}"
+        assert counted <= explained.get(name, set()), f"{name}: {sorted(counted - explained[name])}"

@@ -194,7 +194,7 @@ def test_no_command_ends_in_a_traceback_or_a_wrong_file_where_a_bit_is_flipped(s
             noticed += result.exit_code
         path.write_bytes(before)
         assert {path.name: path.read_bytes() for path in here.glob("*.*")} == good
-    assert noticed > 5
+    assert noticed > 0
 
 
 def test_run_repairs_a_real_run(slamcli: Slamcli, real: Path) -> None:

@@ -129,7 +129,7 @@ def test_from_until_and_force_choose_stages(pipeline: Pipeline, capsys: pytest.C
         pipeline.bring_up_to_date(**choice)
         return told_as_run(capsys)
 
-    assert ran(start="loop") == ["loop", "densify", "octree", "grid2d"]
+    assert ran(start="loop") == list(NAMES[NAMES.index("loop") :])
     assert ran(start="match", until="track") == ["match", "track"]
     assert ran(force=True, until="match") == ["extract", "match"]
     assert ran(until="extract") == []
