@@ -113,6 +113,8 @@ CASES: dict[str, tuple[Callable[[Path], None], set[str]]] = {
     "fx, fy x 0.8": (scaled(fx=0.8, fy=0.8), {"focal_length"}),
     "cx 20 px off": (added(cx=20.0), {"principal_point"}),
     "cy 20 px off": (added(cy=-20.0), {"principal_point"}),
+    "cx 20 px off the other way": (added(cx=-20.0), {"principal_point"}),
+    "cy 20 px off the other way": (added(cy=20.0), {"principal_point"}),
     "cx 30 px off": (added(cx=30.0), {"principal_point"}),
     "depth x 1.5": (depth(lambda d: np.minimum(np.rint(d * 1.5), 65535).astype(np.uint16)), {"depth_scale"}),
     "depth scale x 1.5": (scaled(depth_scale=1.5), {"depth_scale"}),

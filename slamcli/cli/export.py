@@ -51,7 +51,7 @@ def export_trajectory(
     """Write the camera's trajectory to OUT: pose of the colour camera, camera to world.
 
     .txt and .tum hold TUM's format, .kitti KITTI's, .csv a table with a line of names; .g2o is the pose graph of loop, in the world frame.
-    With --mount it is the robot's base instead: x ahead, y left, z up.
+    With --mount it is the robot's base instead: x ahead, y left, z up. With --format OUT may have any name, such as /dev/stdout.
 
     \b
       slamcli export-trajectory path.txt --frame level
@@ -63,7 +63,7 @@ def export_trajectory(
     from slamcli.runs.run_directory import RunDir
     from slamcli.schema import Trajectory
 
-    ending = check_ending(out, *LAYOUT_OF, ".g2o")
+    ending = out.suffix.lower() if layout else check_ending(out, *LAYOUT_OF, ".g2o")
     folder = RunDir.find(run)
     if ending == ".g2o":
         is_plain = (stage or "loop") == "loop" and frame == "world" and mount is None and layout is None

@@ -86,3 +86,5 @@ def test_each_ending_of_a_trajectory_has_its_own_format(slamcli: Callable, known
     assert result.exit_code == 1 and "pose graph" in result.stderr
     result = slamcli("export-trajectory", tmp_path / "t.xml", "-r", known.path)
     assert result.exit_code == 1 and ".csv" in result.stderr and ".g2o" in result.stderr
+    assert slamcli("export-trajectory", tmp_path / "t.xml", "-r", known.path, "--format", "tum").exit_code == 0
+    assert (tmp_path / "t.xml").read_bytes() == (tmp_path / "t.txt").read_bytes()

@@ -45,7 +45,9 @@ def test_the_first_stage_names_what_is_wrong_with_the_images(name: str, room: Pa
     assert BY_IMAGES[name] in told(tmp_path / "run")[cause] and told(tmp_path / "run")[cause] in result.stderr
 
 
-@pytest.mark.parametrize(("name", "words"), [("fx, fy halved", "about fx = 1"), ("cx 20 px off", "principal point")])
+@pytest.mark.parametrize(
+    ("name", "words"), [("fx, fy halved", "about fx = 1"), ("cx 20 px off", "principal point"), ("cy 20 px off", "principal point")]
+)
 def test_the_map_names_a_calibration_that_is_not_the_recordings(
     name: str, words: str, room: Path, tmp_path: Path, slamcli: Slamcli
 ) -> None:
