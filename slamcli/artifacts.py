@@ -1,5 +1,6 @@
 """Records of arrays as folders of `.npy`, one file a field. A record's type is its schema; it is checked at every save and load."""
 
+import io
 import mmap
 from collections.abc import Sequence
 from dataclasses import fields
@@ -46,9 +47,9 @@ def save(value: Any, folder: Path) -> None:
         if path.exists():
             raise ValueError(f"{type(value).__name__}.{spec.name}: {path} is already written by another type")
         column = _narrowest(np.asarray(getattr(value, spec.name), order="C"), spec.metadata["narrow"])
-        with files.written(path), open(path, "xb") as file:
-            np.lib.format.write_array_header_1_0(file, np.lib.format.header_data_from_array_1_0(column))
-            file.write(column.reshape(-1).view(np.uint8).data)  # numpy's own way hides why a write fails
+        header = io.BytesIO()
+        np.lib.format.write_array_header_1_0(header, np.lib.format.header_data_from_array_1_0(column))
+        files.write_new(path, header.getbuffer(), column.reshape(-1).view(np.uint8).data)  # numpy's own way hides why a write fails
 
 
 def _narrowest(column: np.ndarray, narrow: Sequence[np.dtype]) -> np.ndarray:

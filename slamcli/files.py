@@ -22,6 +22,7 @@ from typing import Any, BinaryIO
 from slamcli.errors import SlamError
 
 LARGEST_JSON = 16 << 20  # bytes; a record is a few kB
+AT_ONCE = 1 << 20  # bytes digested and written in turn: as many as the processor keeps near
 LONGEST_NAME = 200  # bytes of a file name; systems allow 255, and the temporary file's is longer
 MOST_LINKS = 40  # followed, as Linux does
 ADVICE = {
@@ -89,6 +90,19 @@ def write_bytes(path: str | Path, data: bytes, *, through_links: bool = True) ->
     """Replace a file at once; `through_links` is that of `whole`."""
     with whole(path, through_links=through_links) as file:
         file.write(data)
+
+
+def write_new(path: Path, *parts: memoryview) -> None:
+    """Write bytes (uint8) to a file that is not there yet, and digest them on the way: `sha256` then need not read them again."""
+    found = hashlib.sha256()
+    with written(path), open(path, "xb") as file:
+        for part in parts:
+            for start in range(0, len(part), AT_ONCE):
+                piece = part[start : start + AT_ONCE]
+                found.update(piece)
+                file.write(piece)
+        file.flush()
+        _known[version(file.fileno())] = found.hexdigest()
 
 
 @contextmanager

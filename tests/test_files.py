@@ -1,5 +1,6 @@
 """Files that appear whole or not at all, sealed records, and what is refused as an input."""
 
+import hashlib
 import json
 import os
 import resource
@@ -210,6 +211,21 @@ def test_only_regular_files_of_a_bounded_size_are_read(tmp_path: Path) -> None:
     assert time.monotonic() - start < 5
     with pytest.raises(SlamError, match="not the name of a file"):
         files.read_bytes("a\0b", limit=5)
+
+
+def test_what_was_digested_while_it_was_written_is_read_again_only_after_a_change(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(files, "AT_ONCE", 7)
+    content, path = bytes(range(50)), tmp_path / "x"
+    files.write_new(path, memoryview(content[:20]), memoryview(content[20:]))
+    assert path.read_bytes() == content
+    with monkeypatch.context() as patch:
+        patch.setattr(files, "open_regular", lambda path: pytest.fail("read again"))
+        assert files.sha256(path) == hashlib.sha256(content).hexdigest()
+    time.sleep(0.02)  # a file system tells times apart by its clock's ticks
+    path.write_bytes(content[:-1] + b"!")
+    assert files.sha256(path) == hashlib.sha256(content[:-1] + b"!").hexdigest()
+    with pytest.raises(SlamError, match="cannot be written"):
+        files.write_new(path, memoryview(content))  # never over what is there
 
 
 def test_a_digest_follows_every_write(tmp_path: Path) -> None:

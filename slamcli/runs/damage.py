@@ -49,8 +49,9 @@ def is_record(record: Mapping[str, Any]) -> bool:
 
 def find(folder: Path, outputs: Mapping[str, Any], names: Iterable[str], *, verify: bool) -> str:
     """Say what is wrong with files of a stage's folder, or "": each has its recorded size and, with `verify`, its recorded digest."""
+    home = os.fspath(folder)
     for name in names:
-        path, entry = os.path.join(folder, name), outputs[name]
+        path, entry = os.path.join(home, name), outputs[name]
         try:
             found = os.stat(path)  # once: a run has a hundred files, and they are looked at before each stage
         except (FileNotFoundError, NotADirectoryError):

@@ -275,11 +275,12 @@ class RunDir:
 
     def _warn_unless_fresh(self, stage: str) -> None:
         """Say once that a result is not what the run's configuration would give now."""
-        known = {name: state for name, (seen, state) in self._judged.items() if seen == self._versions(name)}
+        config = files.version(self.path / "config.toml")
+        known = {name: state for name, (seen, state) in self._judged.items() if seen == (config, self._version(name))}
         if stage in known:
             return
         judged = self.states(until=stage, known=known)
-        self._judged |= {name: (self._versions(name), state) for name, state in judged.items()}
+        self._judged |= {name: ((config, self._version(name)), state) for name, state in judged.items()}
         state = judged[stage]
         if stage in self._warned or state.is_fresh or self.is_cleaned(state):
             return
@@ -289,8 +290,8 @@ class RunDir:
             )
         self._warned |= {stage, state.reason}
 
-    def _versions(self, stage: str) -> tuple:
-        return files.version(self.path / "config.toml"), files.version(self.path / stage / "stage.json")
+    def _version(self, stage: str) -> tuple[int, ...]:
+        return files.version(os.path.join(self.path, stage, "stage.json"))
 
     def mark_cleaned(self, stage: str) -> None:
         """Remember that a stage was deleted on purpose: what was made from it still stands, and may be exported without a warning."""
