@@ -9,8 +9,8 @@ from scenes import Scene, observe, orbit, room_points, sweep
 from slamcli.config.options import SensorConfig, TrackConfig
 from slamcli.geometry import se3
 from slamcli.schema import KEY_FRAME, LOST, ON_DEPTH, RELOCALIZED, TRACKED, Rests, frame_poses, frame_segments
-from slamcli.slam import background_prior
-from slamcli.slam.depth_localization import DepthMatch
+from slamcli.slam import background_prior, initial_pose
+from slamcli.slam.depth_localization import DepthLocalizer, DepthMatch
 from slamcli.slam.localizer import KnownMap, Localizer, nothing_seen
 from slamcli.slam.recording import NOTHING_KNOWN, KnownMotion
 from slamcli.slam.tracker import Tracker
@@ -162,6 +162,37 @@ def test_after_a_frame_of_which_no_landmark_is_known_those_of_its_reference_are_
     tracker.process(6)
     tracks = tracker.tracks()
     assert tracks.state[6] != LOST and tracks.n_inliers[6] > 0.5 * tracks.n_inliers[5]
+
+
+def test_the_reference_whose_landmarks_are_looked_for_is_that_of_the_frame_before():
+    tracker = track(seen(sweep(6)), until=4, key_frame_gap=3, key_frame_share=0.0)
+    ref = tracker.tracks().ref_kf
+    assert ref[3] != ref[2]
+    known = tracker._localizer._still_known(4, nothing_seen(tracker._previous.features))
+    np.testing.assert_array_equal(known, tracker._sparse_map.landmarks_of(int(ref[3])))
+
+
+def test_a_frame_is_looked_for_where_the_last_motion_goes_on(monkeypatch):
+    """That between the two frames before it, whatever the camera did earlier."""
+    predicted, estimate = [], initial_pose.estimate
+    monkeypatch.setattr(initial_pose, "estimate", lambda found, T_cw, *more: predicted.append(T_cw) or estimate(found, T_cw, *more))
+    path = sweep(60)[np.cumsum([0, 1, 3, 2, 5, 1, 4, 6])]
+    tracker = track(seen(path), key_frame_gap=NO_CROWD, key_frame_share=0.0)  # of a single key frame, so that no pose changes afterwards
+    T_wc = frame_poses(tracker.tracks(), tracker.map())
+    assert len(tracker.map().kf_frame) == 1 and len(predicted) == len(path) - 1
+    for i in range(2, len(path)):
+        np.testing.assert_allclose(se3.inverse(predicted[i - 1]), T_wc[i - 1] @ se3.inverse(T_wc[i - 2]) @ T_wc[i - 1], atol=1e-9)
+
+
+def test_depth_is_asked_where_fewer_landmarks_hold_a_frame_than_are_wanted(monkeypatch):
+    scene, asked = seen(sweep(3)), []
+    monkeypatch.setattr(DepthLocalizer, "locate", lambda _, i, frame, found: asked.append((i, found.estimate.n_inliers)))
+    n = int(track(scene, until=2, depth_icp_below=0).tracks().n_inliers[1])
+    assert n > 50 and not asked
+    track(scene, until=2, depth_icp_below=n)
+    assert not asked
+    track(scene, until=2, depth_icp_below=n + 1)
+    assert asked == [(1, n)]
 
 
 def test_what_was_seen_but_is_no_landmark_is_lifted_by_depth_where_the_frame_before_stood():
