@@ -1,4 +1,4 @@
-"""slamcli export-grid, slamcli plan."""
+"""slamcli export-grid."""
 
 from __future__ import annotations
 

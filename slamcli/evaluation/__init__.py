@@ -1,0 +1,1 @@
+"""Results measured: `trajectory_error` and `map_error` against the truth, `map_verdict` without one, and the tables and plots of it."""

@@ -166,16 +166,7 @@ def _sort_points(
             x, y = (T[0, 3] + z * dx) / cell - corner[0], (T[1, 3] + z * dy) / cell - corner[1]
             height = T[2, 3] + z * dz - _height(ground, x, y)
             if height < -drop - slack and T[2, 3] > 0.0:
-                at, is_met = T[2, 3] / -dz, False
-                for _ in range(CROSSINGS):
-                    j, i = math.floor((T[0, 3] + at * dx) / cell - corner[0]), math.floor((T[1, 3] + at * dy) / cell - corner[1])
-                    on_floor = (T[2, 3] - _height(ground, j, i)) / -dz
-                    is_met = abs(on_floor - at) * -dz <= low
-                    if is_met:
-                        break
-                    at = on_floor
-                if is_met and at <= far and 0 <= i < side and 0 <= j < side and hole[i, j] < 255:
-                    hole[i, j] += 1
+                _mark_hole(T, dx, dy, dz, sight, ground, hole)
                 continue
             if z > far or height >= high + TOP_REACH:
                 continue
@@ -193,18 +184,39 @@ def _sort_points(
                 if not _is_level(depth, rays, T, u, v, above, z, dz):
                     continue
                 floor[i, j] = SEEN
-                # Back along the ray, as long as it is below the band.
                 rise = low - height if height > 0.0 else low
                 if rise > -z * dz:
                     rise = -z * dz
-                reach = rise / -dz
-                steps = int(reach * math.sqrt(dx * dx + dy * dy) / cell)
-                for s in range(1, steps + 1):
-                    back = reach * s / (steps + 1)
-                    i2, j2 = math.floor(y - back * dy / cell), math.floor(x - back * dx / cell)
-                    is_new = 0 <= i2 < side and 0 <= j2 < side and floor[i2, j2] == NOT_SEEN
-                    if is_new and abs(ground[i2, j2] - ground[i, j]) <= low:  # not over an edge that the floor ends at
-                        floor[i2, j2] = PASSED
+                _mark_passed(x, y, dx, dy, rise / -dz, sight, ground, floor)
+
+
+@kernel
+def _mark_hole(T, dx, dy, dz, sight, ground, hole):
+    """Count the cell in which a line of sight of this direction meets the floor, if it does so within range."""
+    corner, cell, low, far, side = sight.corner, sight.cell, sight.low, sight.far, hole.shape[0]
+    at, is_met, i, j = T[2, 3] / -dz, False, 0, 0
+    for _ in range(CROSSINGS):
+        j, i = math.floor((T[0, 3] + at * dx) / cell - corner[0]), math.floor((T[1, 3] + at * dy) / cell - corner[1])
+        on_floor = (T[2, 3] - _height(ground, j, i)) / -dz
+        is_met = abs(on_floor - at) * -dz <= low
+        if is_met:
+            break
+        at = on_floor
+    if is_met and at <= far and 0 <= i < side and 0 <= j < side and hole[i, j] < 255:
+        hole[i, j] += 1
+
+
+@kernel
+def _mark_passed(x, y, dx, dy, reach, sight, ground, floor):
+    """Mark the cells over which a line of sight runs below the band: back along it, by `reach`, from the place on the floor where it ends."""
+    side, at_end = floor.shape[0], ground[math.floor(y), math.floor(x)]
+    steps = int(reach * math.sqrt(dx * dx + dy * dy) / sight.cell)
+    for s in range(1, steps + 1):
+        back = reach * s / (steps + 1)
+        i, j = math.floor(y - back * dy / sight.cell), math.floor(x - back * dx / sight.cell)
+        is_new = 0 <= i < side and 0 <= j < side and floor[i, j] == NOT_SEEN
+        if is_new and abs(ground[i, j] - at_end) <= sight.low:  # not over an edge that the floor ends at
+            floor[i, j] = PASSED
 
 
 @kernel

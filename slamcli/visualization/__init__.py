@@ -1,0 +1,1 @@
+"""Pictures, films and views of what a run made."""

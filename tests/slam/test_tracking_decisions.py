@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from scenes import Scene, observe, orbit, room_points, sweep
+from scenes import RATE, Scene, observe, orbit, room_points, sweep
 
 from slamcli.config.options import SensorConfig, TrackConfig
 from slamcli.geometry import se3
@@ -170,6 +170,7 @@ def test_the_reference_whose_landmarks_are_looked_for_is_that_of_the_frame_befor
     assert ref[3] != ref[2]
     known = tracker._localizer._still_known(4, nothing_seen(tracker._previous.features))
     np.testing.assert_array_equal(known, tracker._sparse_map.landmarks_of(int(ref[3])))
+    np.testing.assert_array_equal(tracker._localizer._still_known(4, np.array([7, -1, 3], np.int32)), [7, 3])
 
 
 def test_a_frame_is_looked_for_where_the_last_motion_goes_on(monkeypatch):
@@ -253,6 +254,21 @@ def test_a_key_frame_is_joined_by_the_background_within_its_segment_alone():
     map_ = tracker.map()
     segment = map_.kf_segment[map_.edge_kf]
     assert (segment[:, 0] == segment[:, 1]).all() and (segment == 1).all(axis=1).sum() == 1
+
+
+def test_a_pose_is_weighed_against_the_motion_since_the_frame_before_and_since_a_moment_ago(monkeypatch):
+    scene, earlier = seen(sweep(14)), []
+    monkeypatch.setattr(background_prior, "contradicts", lambda found, expected, T_wp: earlier.append(T_wp))
+    motion = KnownMotion(background=drifting(scene.T_gc))
+    tracker = track(scene, motion=motion, key_frame_gap=NO_CROWD, key_frame_share=0.0)
+    T_wc = frame_poses(tracker.tracks(), tracker.map())
+    a_moment_ago = 13 - int(np.ceil(background_prior.LOOK_BACK * RATE))
+    np.testing.assert_allclose(earlier[-2:], [T_wc[12], T_wc[a_moment_ago]], atol=1e-12)
+
+
+def test_the_background_carries_the_second_frame_on():
+    scene = seen(sweep(4), blind=(1,))
+    assert (track(scene, motion=KnownMotion(background=drifting(scene.T_gc))).tracks().state != LOST).all()
 
 
 def test_where_no_landmark_holds_a_frame_the_background_carries_it_on():
