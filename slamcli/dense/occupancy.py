@@ -33,6 +33,23 @@ class Scan(NamedTuple):
     frame: int = 0
 
 
+class _Update(NamedTuple):
+    """What a look changes a cell's log-odds by, and their bounds."""
+
+    miss: f4
+    hit: f4
+    lowest: f4
+    highest: f4
+
+
+class _Cells(NamedTuple):
+    """What is known of the cells of each block."""
+
+    log_odds: f4[:, ::1]  # (R, 512), NaN = never seen
+    misses: u1[:, ::1]  # since the last hit
+    last_hit: i4[:, ::1]  # scan
+
+
 def log_odds(probability: float) -> np.float32:
     """Return ln(p / (1 - p)); (12) of Zhao et al."""
     return np.float32(elementary.log(probability / (1.0 - probability)))
@@ -49,15 +66,15 @@ class OccupancyMap:
         clamp_min, clamp_max : bounds of a cell's probability; the narrower, the sooner a moved object fades
         """
         self.resolution = float(resolution)
-        self._update = log_odds(miss), log_odds(hit), log_odds(clamp_min), log_odds(clamp_max)
+        self._update = _Update(log_odds(miss), log_odds(hit), log_odds(clamp_min), log_odds(clamp_max))
         row = (BLOCK_CELLS,)
         self._blocks = voxel.VoxelRows(log_odds=(row, np.float32, np.nan), misses=(row, np.uint8, 0), last_hit=(row, np.int32, 0))
 
     @property
     def looks(self) -> int:
         """Return how many misses make the surest cell free."""
-        miss, _, lowest, highest = self._update
-        return int(np.ceil((highest - np.maximum(lowest, 0.0)) / -miss))
+        by = self._update
+        return int(np.ceil((by.highest - np.maximum(by.lowest, 0.0)) / -by.miss))
 
     def insert(self, x_w: np.ndarray, origin: np.ndarray, *, max_range: float, discretize: bool = False, frame: int = 0) -> None:
         """Insert one scan.
@@ -84,9 +101,8 @@ class OccupancyMap:
                 f"an octree of {self.resolution:g} m cells would fill more than {size:.0f} GiB of memory: raise octree.resolution"
             )
         blocks.reserve(n_touched)
-        blocks.n = _update_cells(
-            rows_of_8, lower, block_row, blocks.slot_row, blocks.row_key, blocks.n, *blocks.columns.values(), *self._update, frame
-        )
+        cells = _Cells(**blocks.columns)
+        blocks.n = _update_cells(rows_of_8, lower, block_row, blocks.slot_row, blocks.row_key, blocks.n, cells, self._update, frame)
 
     def doubted(self, misses: int) -> tuple[np.ndarray, np.ndarray]:
         """Find cells that are occupied, but that the last so many scans that touched them saw free.
@@ -166,17 +182,13 @@ def _update_cells(
     slot_row: i4[::1],
     row_key: i8[::1],
     n_rows: i8,
-    value: f4[:, ::1],
-    misses: u1[:, ::1],
-    last_hit: i4[:, ::1],
-    miss: f4,
-    hit: f4,
-    lowest: f4,
-    highest: f4,
+    cells: _Cells,
+    by: _Update,
     frame: i8,
 ):
     """Update every marked cell once, (11) and (13) of Zhao et al. with clamping; returns the number of blocks."""
-    bx, by, bz = lower[0] >> 3, lower[1] >> 3, lower[2] >> 3
+    value, misses, last_hit = cells
+    block_x, block_y, block_z = lower[0] >> 3, lower[1] >> 3, lower[2] >> 3
     for z in range(rows_of_8.shape[0]):
         for y in range(rows_of_8.shape[1]):
             in_zy = spread(z & 7) << 2 | spread(y & 7) << 1
@@ -186,7 +198,8 @@ def _update_cells(
                     continue
                 row = block_row[z >> 3, y >> 3, x]
                 if row == TOUCHED:
-                    row = find_or_add(slot_row, row_key, n_rows, spread(x + bx) | spread((y >> 3) + by) << 1 | spread((z >> 3) + bz) << 2)
+                    key = spread(x + block_x) | spread((y >> 3) + block_y) << 1 | spread((z >> 3) + block_z) << 2
+                    row = find_or_add(slot_row, row_key, n_rows, key)
                     n_rows = max(n_rows, row + 1)
                     block_row[z >> 3, y >> 3, x] = row
                 for k in range(8):
@@ -197,8 +210,8 @@ def _update_cells(
                     old = value[row, at]
                     if old != old:
                         old = np.float32(0.0)
-                    new = old + (hit if mark == OCCUPIED else miss)
-                    value[row, at] = min(max(new, lowest), highest)
+                    new = old + (by.hit if mark == OCCUPIED else by.miss)
+                    value[row, at] = min(max(new, by.lowest), by.highest)
                     if mark == OCCUPIED:
                         misses[row, at], last_hit[row, at] = 0, frame
                     elif misses[row, at] < 255:

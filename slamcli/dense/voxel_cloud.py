@@ -4,6 +4,7 @@ A voxel holds weighted sums only, so memory grows with the surface seen and not 
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import f4, f8, i4, i8, u1
@@ -48,20 +49,10 @@ class VoxelCloud:
         """Add what one key frame saw; `rgb` (H, W, 3) uint8."""
         self._rows.reserve(len(seen.pixel))
         rows = self._rows
-        rows.n = _add_points(
-            seen.pixel,
-            seen.xyz_c,
-            seen.normal_c,
-            seen.weight,
-            np.ascontiguousarray(rgb).reshape(-1, 3),
-            np.ascontiguousarray(T_wc, dtype=np.float64),
-            1.0 / self.side,
-            rows.slot_row,
-            rows.row_key,
-            rows.n,
-            rows.columns["sums"],
-            rows.columns["count"],
-        )
+        points = _Points(seen.pixel, seen.xyz_c, seen.normal_c, seen.weight, np.ascontiguousarray(rgb).reshape(-1, 3))
+        T_wc = np.ascontiguousarray(T_wc, dtype=np.float64)
+        voxels = _Voxels(**rows.columns)
+        rows.n = _add_points(points, T_wc, 1.0 / self.side, rows.slot_row, rows.row_key, rows.n, voxels)
 
     def cloud(self, *, min_points: int = 1, neighbours: int = 0, max_deviation: float = np.inf) -> Cloud:
         """Return the voxels with at least `min_points` readings, in Morton order.
@@ -84,22 +75,28 @@ class VoxelCloud:
         return Cloud(xyz[keep].astype(np.float32), rgb[keep], normal[keep])
 
 
+class _Points(NamedTuple):
+    """`Surface`, with the picture that has its colours."""
+
+    pixel: i4[::1]
+    xyz_c: f4[:, ::1]
+    normal_c: f4[:, ::1]
+    weight: f4[::1]
+    rgb: u1[:, ::1]  # (H W, 3)
+
+
+class _Voxels(NamedTuple):
+    """What is known of each voxel."""
+
+    sums: f4[:, ::1]  # (R, 10), see WEIGHT, OFFSET, NORMAL, RGB
+    count: i4[::1]  # (R,) readings
+
+
 @kernel
-def _add_points(
-    pixel: i4[::1],
-    xyz_c: f4[:, ::1],
-    normal_c: f4[:, ::1],
-    weight: f4[::1],
-    rgb: u1[:, ::1],
-    T_wc: f8[:, ::1],
-    per_side: f8,
-    slot_row: i4[::1],
-    row_key: i8[::1],
-    n_rows: i8,
-    sums: f4[:, ::1],
-    count: i4[::1],
-):
-    """Add weighted points to their voxels; sums are weight, offset from the centre [voxels], normal, colour. Returns the rows in use."""
+def _add_points(points: _Points, T_wc: f8[:, ::1], per_side: f8, slot_row: i4[::1], row_key: i8[::1], n_rows: i8, voxels: _Voxels):
+    """Add weighted points to their voxels. Returns the rows in use."""
+    pixel, xyz_c, normal_c, weight, rgb = points
+    sums, count = voxels
     half = 1 << 20
     last, row = np.int64(-1), np.int64(-1)
     for i in range(len(pixel)):

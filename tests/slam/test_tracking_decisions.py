@@ -309,7 +309,7 @@ def test_a_pose_is_weighed_against_the_motion_since_the_frame_before_alone():
 
 def test_a_frame_that_depth_places_counts_the_landmarks_that_agree():
     tracker = track(seen(sweep(6, length=0.1)), until=5)
-    landmark = np.array([4, -1, 7, -1, -1, 9, 2], np.int32)
+    landmark = np.array([4, -1, 0, -1, -1, 9, 2], np.int32)
     placement = SimpleNamespace(kf=0, T_cw=np.eye(4))
     location = tracker._localizer._record_by_depth(5, DepthMatch(placement, landmark, is_anchored=False))
     tracks = tracker.tracks()
