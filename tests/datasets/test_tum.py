@@ -1,6 +1,7 @@
 """The TUM reader: association as the data set's own script does it, and every kind of broken recording."""
 
 import os
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -41,6 +42,17 @@ def test_association_equals_the_data_sets_script(a: np.ndarray, b: np.ndarray, o
 def test_the_bound_is_strict() -> None:
     assert len(associate(np.array([1.0]), np.array([1.5]), max_difference=0.5)) == 0  # halves are exact
     assert len(associate(np.array([1.0]), np.array([np.nextafter(1.5, 0.0)]), max_difference=0.5)) == 1
+
+
+def test_dense_stamps_take_no_more_memory_than_there_are_lines() -> None:
+    """All stamps of each list lie near all of the other: 25 million pairs are near enough, of which 5000 are taken."""
+    dense = np.arange(5000) * 1e-7
+    tracemalloc.start()
+    pairs = associate(dense, dense + 3e-8)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    np.testing.assert_array_equal(pairs, np.stack([np.arange(5000)] * 2, axis=1))
+    assert peak < 20_000_000
 
 
 def test_values_of_a_sound_recording(tmp_path: Path) -> None:
