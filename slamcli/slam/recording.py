@@ -1,4 +1,4 @@
-"""What tracking takes of a recording: its frames as the stages before left them, what is known of the camera's motion; and what it leaves."""
+"""What tracking takes of a recording: its frames as the stages before left them, what is known of the camera's motion, and a recording once tracked."""
 
 from dataclasses import dataclass
 
