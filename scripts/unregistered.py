@@ -14,13 +14,16 @@ import cv2
 import numpy as np
 
 import slamcli
+from slamcli import inspection
 from slamcli.console import table
 from slamcli.datasets import Dataset, open_dataset
 from slamcli.geometry.camera import Camera
 from slamcli.geometry.depth_registration import Registration
+from slamcli.slam.doubt import Finding
 
 TURN_DEG = 0.5
-CASES = {"585 px, 25 mm": (585.0, 0.025), "385 px, 15 mm": (385.0, 0.015)}
+# Focal length [px], offset [m], principal point [px].
+CASES = {"585 px, 25 mm": (585.0, 0.025, (320.0, 240.0)), "385 px, 15 mm": (385.0, 0.015, (312.5, 246.0))}
 
 
 def main() -> None:
@@ -36,8 +39,8 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder)
         rows.append(["registered", *figures(write(dataset, place / "registered", n, None, is_told=True), place / "runs/registered")])
-        for name, (focal, aside) in CASES.items():
-            given = rig(dataset.camera, focal, aside)
+        for name, (focal, aside, centre) in CASES.items():
+            given = rig(dataset.camera, focal, aside, centre)
             for is_told in (True, False) if arguments.kept_back else (True,):
                 label = f"{name}, {'given' if is_told else 'kept back'}"
                 folder_name = label.replace(" ", "_").replace(",", "")
@@ -46,9 +49,9 @@ def main() -> None:
     print(table(rows))
 
 
-def rig(colour: Camera, focal: float, aside: float) -> Registration:
+def rig(colour: Camera, focal: float, aside: float, centre: tuple[float, float]) -> Registration:
     """Put a depth camera beside the colour camera."""
-    depth_camera = Camera(640, 480, focal, focal, 320.0, 240.0, depth_scale=colour.depth_scale)
+    depth_camera = Camera(640, 480, focal, focal, *centre, depth_scale=colour.depth_scale)
     T_cd = np.eye(4)
     T_cd[:3, :3] = cv2.Rodrigues(np.radians(TURN_DEG) * np.array([0.5, 0.7, 0.5]))[0]
     T_cd[0, 3] = aside
@@ -88,9 +91,14 @@ def write(dataset: Dataset, out: Path, n: int, given: Registration | None, *, is
     return out
 
 
+def look(dataset: Dataset) -> list[Finding]:
+    """Look at a recording first, as `slamcli run` does: it is what starts the search for a depth camera."""
+    return inspection.doubts(inspection.quick_look(dataset))
+
+
 def figures(recording: Path, out: Path) -> list[str]:
     """Run a recording up to loop and measure it."""
-    run = slamcli.run(str(recording), path=out, until="loop")
+    run = slamcli.run(str(recording), path=out, until="loop", look=look)
     ape = run.ape()
     return [f"{np.sqrt(np.mean(ape.error**2)):.4f}", f"{ape.rmse_scaled:.4f}", f"{ape.scale:.4f}", str(ape.n_poses)]
 

@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from slamcli.formats.cloud import Points
     from slamcli.geometry.camera import Camera
     from slamcli.geometry.octree import Octree
+    from slamcli.inspection.depth_camera import DepthCamera
     from slamcli.navigation.floor_plan import FloorPlan
     from slamcli.schema import Grid, Ground, Trajectory
     from slamcli.slam.doubt import Finding
@@ -42,6 +43,9 @@ if TYPE_CHECKING:
 __all__ = ["Run", "open_run", "run"]
 
 log = logging.getLogger(__name__)
+
+TRIAL_FRAMES = 300  # at the recording's beginning, of which a map is made to ask it about the depth camera that edges told
+LEAST_TRIAL = 1e-3  # [s]; an end of 0 is none
 
 
 def run(
@@ -294,12 +298,25 @@ def _registered(
     camera = depth_camera.find(dataset) if dataset.depth_camera is None else None
     if camera is None or not camera.is_sure:
         return opened, dataset, config, found
+    camera = _told_by_map(camera, dataset, config)
     registered = replace(config, recording=replace(config.recording, depth_camera=camera.option))
     opened, dataset, _ = reopen(resolve=lambda config: registered)
     told = f"{camera.told}; -s recording.find_depth_camera=false leaves depth as it is"
     log.warning("%s: %s", dataset.root, told)
     others = [finding for finding in found if finding.name != "registration"]
     return opened, dataset, registered, [*others, Finding("depth_camera", told)]
+
+
+def _told_by_map(camera: "DepthCamera", dataset: "Dataset", config: Config) -> "DepthCamera":
+    """Make a map of the recording's beginning with the depth camera that edges told, and return the camera as the map knows it."""
+    from slamcli.runs import trial
+
+    seconds = float(dataset.stamp[min(len(dataset), TRIAL_FRAMES) - 1] - dataset.stamp[0])
+    beginning = replace(config.recording, depth_camera=camera.option, end=config.recording.start + max(seconds, LEAST_TRIAL))
+    config = replace(config, recording=beginning)
+    evidence = trial.registration_evidence(_opened(str(dataset.root), config, None, silent), config, camera.registration(dataset.camera))
+    better = camera.told_by(evidence) if evidence is not None else camera
+    return better if better.is_sure else camera
 
 
 def create_run(

@@ -309,7 +309,7 @@ def version(path: str | Path | int) -> tuple[int, ...]:
     """Return what changes when somebody writes to a file or replaces it; nothing where it is not there."""
     try:
         return _version(os.stat(path))
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         return ()
 
 

@@ -9,12 +9,14 @@ import sys
 from functools import cache
 from types import ModuleType
 
+from slamcli import address_space
 from slamcli.errors import SlamError
 
 
 @cache
 def load_open3d() -> ModuleType:
-    """Import Open3D, quiet but for errors; raises SlamError with what to install where that fails."""
+    """Import Open3D, quiet but for errors; raises SlamError with what to install or to allow where that fails."""
+    address_space.require()
     if sys.platform.startswith("linux"):
         _preload_libusb()
     try:

@@ -523,9 +523,12 @@ LAYOUTS = (
     Layout("ros1_compressed", ros1, "rosbag", override=UNIT_KEPT),
     Layout("ros1_raw", _ros(ros1, colour="bgr8", depth="16UC1"), "rosbag"),
     Layout("ros1_lz4", _ros(ros1, packed=True, colour="rgb8", depth="png"), "rosbag"),
+    Layout("ros1_rvl", _ros(ros1, colour="rgb8", depth="rvl"), "rosbag"),
+    Layout("ros2_raw", _ros(ros2, colour="bgr8", depth="16UC1"), "rosbag"),
     Layout("ros2_sqlite", _ros(ros2, colour="jpeg", depth="rvl"), "rosbag"),
     Layout("ros2_zstd", _ros(ros2, packed="message", colour="rgb8"), "rosbag", override=UNIT_KEPT),
     Layout("ros2_mcap", _ros(ros2, storage="mcap", depth="png"), "rosbag"),
+    Layout("mcap_raw", _ros(mcap, colour="bgr8", depth="16UC1"), "rosbag"),
     Layout("mcap", _ros(mcap, colour="rgb8", depth="rvl"), "rosbag"),
 )
 

@@ -19,7 +19,7 @@ MODULES = sorted(PACKAGE.rglob("*.py"))
 LAYERS = (
     ("errors", "data"),
     ("__init__", "user_cache"),
-    ("files", "interruption"),
+    ("files", "interruption", "address_space"),
     ("schema", "artifacts", "parallel", "console", "open3d_loader"),
     ("jit",),
     ("geometry",),

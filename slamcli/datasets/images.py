@@ -5,7 +5,6 @@ integer arithmetic, hence the same on every machine: a JPEG stores it, a PNG's i
 ``cv2.cvtColor`` (libpng's own reduction would honour gamma chunks and differ by a grey level in half of all pixels).
 """
 
-import struct
 import tokenize
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,15 +14,13 @@ import numpy as np
 
 from slamcli import files
 from slamcli.datasets import png
+from slamcli.datasets.image_header import JPEG_MAGIC, KINDS, image_size
 from slamcli.errors import BadFrame, SlamError
 
 MAX_BYTES = 256 << 20  # of one image file
 MAX_PIXELS = 100_000_000  # of one image
-JPEG_MAGIC = b"\xff\xd8\xff"
 EXR_MAGIC = b"\x76\x2f\x31\x01"
 NPY_MAGIC = b"\x93NUMPY"
-JPEG_SIZE_MARKERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # SOF0..15 without DHT, JPG, DAC
-JPEG_BARE_MARKERS = frozenset({0x01, *range(0xD0, 0xD9)})  # carry no length
 REDUCED = {2: cv2.IMREAD_REDUCED_GRAYSCALE_2, 4: cv2.IMREAD_REDUCED_GRAYSCALE_4, 8: cv2.IMREAD_REDUCED_GRAYSCALE_8}
 REDUCED_COLOUR = {2: cv2.IMREAD_REDUCED_COLOR_2, 4: cv2.IMREAD_REDUCED_COLOR_4, 8: cv2.IMREAD_REDUCED_COLOR_8}
 
@@ -91,36 +88,12 @@ def check_whole(data: bytes, name: str) -> None:
         raise BadFrame(f"{name}: JPEG is cut off")
 
 
-def image_size(data: bytes) -> tuple[int, int] | None:
-    """Read (width, height) from the header of a PNG or JPEG; None for other formats and for broken headers."""
-    if data.startswith(png.MAGIC) and len(data) >= 24:
-        return struct.unpack(">II", data[16:24])
-    if not data.startswith(JPEG_MAGIC):
-        return None
-    at = 2
-    while at + 9 <= len(data) and data[at] == 0xFF:
-        marker = data[at + 1]
-        if marker in JPEG_SIZE_MARKERS:
-            height, width = struct.unpack(">HH", data[at + 5 : at + 9])
-            return width, height
-        if marker == 0xFF:  # fill byte
-            at += 1
-        elif marker in JPEG_BARE_MARKERS:
-            at += 2
-        else:
-            at += 2 + struct.unpack(">H", data[at + 2 : at + 4])[0]
-    return None
-
-
 def picture_size(picture: Picture, name: str) -> tuple[int, int]:
     """Return (width, height) of a picture, from its header where that says it; BadFrame where it is no picture."""
     if isinstance(picture, Pixels):
         found = picture.size
-    elif (header := image_size(picture)) is not None:
-        found = header
     else:
-        height, width = _decode(picture, cv2.IMREAD_UNCHANGED, name).shape[:2]
-        found = width, height
+        found = _claimed_size(picture, name)
     if 0 in found:
         raise BadFrame(f"{name}: has no pixel ({found[0]} x {found[1]} px)")
     return found
@@ -158,7 +131,6 @@ def decode_depth(data: bytes, size: tuple[int, int] | None = None, *, name: str)
 
     PNG, TIFF and PNM of 16 bits or of floats, EXR, and numpy's .npy without objects.
     """
-    _check_size(data, size, name)
     if data.startswith(EXR_MAGIC):
         from slamcli.datasets import exr
 
@@ -166,6 +138,7 @@ def decode_depth(data: bytes, size: tuple[int, int] | None = None, *, name: str)
     elif data.startswith(NPY_MAGIC):
         raw = decode_npy(data, name)
     else:
+        _check_size(data, size, name)
         grey = png.grey_16(data, size or image_size(data) or (0, 0))
         raw = _decode(data, cv2.IMREAD_UNCHANGED, name) if grey is None else grey
     return checked_depth(raw, size, name=name)
@@ -232,13 +205,25 @@ def _reduced(image: np.ndarray, size: tuple[int, int], reduction: int) -> np.nda
 
 def _check_size(data: bytes, size: tuple[int, int] | None, name: str) -> None:
     """Compare the header's size before any memory is reserved for pixels."""
-    found = image_size(data)
-    if found is None:
-        return
+    found = _claimed_size(data, name)
     if size is not None and found != size:
         raise _size_error(name, found, size)
+
+
+def _claimed_size(data: bytes, name: str) -> tuple[int, int]:
+    """Read the size from the header; BadFrame for what is no image of a known kind, and for one too large to be meant."""
+    found = image_size(data)
+    if found is None:
+        raise BadFrame(f"{name}: is damaged, or not an image ({KINDS})")
     if found[0] * found[1] > MAX_PIXELS:
         raise BadFrame(f"{name}: {found[0]} x {found[1]} px is too large for an image")
+    return found
+
+
+def decode_as_it_is(data: bytes, *, name: str) -> np.ndarray:
+    """Decode an image whose size and kind of pixels are not known before, as (H, W) or (H, W, C) of its own type."""
+    _check_size(data, None, name)
+    return _decode(data, cv2.IMREAD_UNCHANGED, name)
 
 
 def _decode(data: bytes, flags: int, name: str, size: tuple[int, int] | None = None) -> np.ndarray:

@@ -27,12 +27,30 @@ class Shared:
     sigma: np.ndarray  # (G,) standard deviations
 
 
+@dataclass(frozen=True)
+class Evidence:
+    """What observations alone say of shared numbers g, the map eliminated: information @ g = pull."""
+
+    information: np.ndarray  # (G, G)
+    pull: np.ndarray  # (G,)
+
+
 def estimate(problem: Problem, columns: np.ndarray, *, prior: np.ndarray, prior_sigma: np.ndarray) -> Shared | None:
     """Estimate the shared numbers at the problem's start, which is to be its optimum; its loss is to be that of least squares.
 
     columns : (O, 3, G) by how much u, v [px] and depth [m] of each observation grow per unit of each number
     prior, prior_sigma : (G,) what is believed before looking. None where the map is not determined.
     """
+    seen = evidence(problem, columns)
+    if seen is None:
+        return None
+    weight = 1.0 / (prior_sigma * prior_sigma)
+    A = seen.information + np.diag(weight)
+    return Shared(value=solve(A, seen.pull + prior * weight), sigma=np.sqrt(np.diag(inverse(A))))
+
+
+def evidence(problem: Problem, columns: np.ndarray) -> Evidence | None:
+    """Gather what the observations of a problem at its optimum say of shared numbers; arguments as for `estimate`."""
     columns = columns[problem.order]
     # Outliers stay out; among the inliers Huber's weights are close to 1 and are left out.
     is_used = problem.is_inlier(problem.chi2(problem.start))
@@ -51,11 +69,8 @@ def estimate(problem: Problem, columns: np.ndarray, *, prior: np.ndarray, prior_
     J = (columns * sqrt_w[:, :, None]).reshape(-1, columns.shape[2])
     through_landmarks = np.array([[_landmark_product(a, problem.V_inv, b) for b in (*lifted, b_0)] for a in lifted])
     through_map = product(reduced, solved.T) + through_landmarks
-    weight = 1.0 / (prior_sigma * prior_sigma)
-    A = product(J.T, J) - through_map[:, :-1] + np.diag(weight)
     # b is minus the gradient: J_map^T w r = -b_0
-    value = solve(A, product(J.T, r.ravel()) + through_map[:, -1] + prior * weight)
-    return Shared(value=value, sigma=np.sqrt(np.diag(inverse(A))))
+    return Evidence(product(J.T, J) - through_map[:, :-1], product(J.T, r.ravel()) + through_map[:, -1])
 
 
 def _landmark_product(a: np.ndarray, V_inv: np.ndarray, b: np.ndarray) -> float:

@@ -57,15 +57,16 @@ class Registration:
     def apply(self, depth: np.ndarray) -> np.ndarray:
         """Return depth (h, w) float32 [m] of the depth camera as the colour camera would see it, (H, W) float32, NaN = none.
 
-        Each reading covers its footprint among the raw pixels of the colour camera; where several do, the nearest counts.
+        Each reading covers its footprint among the raw pixels of the colour camera. Where several do, the nearest surface counts, and of its
+        readings the one whose middle is closest to the pixel's: the nearest reading would bring floors closer by half a pixel.
         """
         to = self.colour_camera
-        out = np.full((to.height, to.width), np.inf, dtype=np.float32)
+        out, away = (np.full((to.height, to.width), np.inf, dtype=np.float32) for _ in range(2))
         magnification = np.array([to.fx / self.depth_camera.fx, to.fy / self.depth_camera.fy]) * (0.5 * OVERLAP)
         lens = 2 if to.lens == EQUIDISTANT else 3 if to.is_rational else 1 if to.is_distorted else 0
         intrinsics = np.array([to.fx, to.fy, to.cx, to.cy])
         to_colour = (self._ray, self.T_cd[:3, 3].copy(), intrinsics, lens, to.coefficients, self._near, self._path)
-        splat(np.ascontiguousarray(depth), *to_colour, magnification, out)
+        splat(np.ascontiguousarray(depth), *to_colour, magnification, out, away)
         return out
 
 
@@ -116,11 +117,13 @@ def splat(
     path: f4[:, :, :, ::1],
     half: f8[::1],
     out: f4[:, ::1],
+    away: f4[:, ::1],
 ):
-    """Lay each reading of `depth` on `out` (H, W), filled with inf before; the nearest wins, and what is left uncovered becomes NaN.
+    """Lay each reading of `depth` on `out` (H, W), filled with inf before; the nearest surface wins, and what is left uncovered becomes NaN.
 
     ray (h, w, 3), t (3,): x_c = depth * ray + t. near, path : of `Registration`, for a lens.
-    half (2,): half a footprint's width and height [px] at equal distances.
+    half (2,): half a footprint's width and height [px] at equal distances. away (H, W), filled with inf before: [px^2] from each pixel to
+    the middle of the reading that it shows.
     """
     fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
     rows, columns, width = out.shape[0], out.shape[1], depth.shape[1]
@@ -152,10 +155,15 @@ def splat(
             left, right = int(u - half_u + 1.0), min(int(u + half_u), columns - 1)  # u - half_u > -1 here: truncation rounds down
             top, bottom = int(v - half_v + 1.0), min(int(v + half_v), rows - 1)
             reading = f4(z)
+            before, beside = f4(reading * (1.0 + SURFACE)), f4(reading * (1.0 - SURFACE))
+            at_u, at_v = f4(u), f4(v)
             for row in range(top, bottom + 1):
+                below = f4(row) - at_v
                 for column in range(left, right + 1):
-                    if reading < out[row, column]:
-                        out[row, column] = reading
+                    there, beyond = out[row, column], f4(column) - at_u
+                    aside = beyond * beyond + below * below
+                    if before < there or (beside <= there and aside < away[row, column]):
+                        out[row, column], away[row, column] = reading, aside
     for row in range(rows):
         for column in range(columns):
             if out[row, column] == np.inf:

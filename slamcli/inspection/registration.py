@@ -74,6 +74,11 @@ class Edges:
     xy: np.ndarray  # (N, 2) px
     is_along_y: np.ndarray  # (N,) bool, whether the jump is along y
     depth: np.ndarray  # (N,) float32 [m] of the nearer side
+    outward: np.ndarray  # (N,) float32, +1 where the farther side is the one with the larger coordinate, else -1
+
+    def thinned(self, step: int) -> "Edges":
+        """Return every `step`-th of them."""
+        return Edges(self.stamp, self.xy[::step], self.is_along_y[::step], self.depth[::step], self.outward[::step])
 
 
 def measure(dataset: Dataset, *, workers: int, blocks: int = BLOCKS) -> Registration:
@@ -149,7 +154,7 @@ def _velocity(grey: np.ndarray, following: np.ndarray, seconds: float, reduction
 
 def _depth_edges(depth: np.ndarray, stamp: float, rng: np.random.Generator) -> Edges:
     """Find depth jumps along rows and columns, from both sides so that their offsets cancel."""
-    points, flags, depths = [], [], []
+    points, flags, depths, outward = [], [], [], []
     margin = LARGEST_SHIFT + 2
     height, width = depth.shape
     for along_x in (True, False):
@@ -165,7 +170,8 @@ def _depth_edges(depth: np.ndarray, stamp: float, rng: np.random.Generator) -> E
             points.append(np.stack([x[inside], y[inside]], axis=1))
             flags.append(np.full(len(inside), not along_x))
             depths.append(ahead[row, column][inside])
-    return Edges(stamp, np.concatenate(points).astype(np.float32), np.concatenate(flags), np.concatenate(depths))
+            outward.append(np.full(len(inside), sign, dtype=np.float32))
+    return Edges(stamp, np.concatenate(points).astype(np.float32), np.concatenate(flags), np.concatenate(depths), np.concatenate(outward))
 
 
 def _jumps(lines: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -209,7 +215,7 @@ def _score(colours: Colours, places: np.ndarray, dx: int, dy: int) -> float:
 
 def _first_guess(colours: Colours, edges: list[Edges]) -> float:
     """Find the lag near which the best shift is best, on a coarse lattice and a part of the points: far off, neither is found alone."""
-    few = [Edges(e.stamp, e.xy[::THINNING], e.is_along_y[::THINNING], e.depth[::THINNING]) for e in edges]
+    few = [e.thinned(THINNING) for e in edges]
     best = {}
     for lag in FIRST_LAGS:
         places = _at_lag(colours, few, lag)
@@ -236,7 +242,7 @@ def magnification_of(dataset: Dataset, colours: Colours, edges: list[Edges]) -> 
         for e in edges:
             xy = centre + np.float32(factor) * (e.xy[::2] - centre)
             inside = ((xy > LARGEST_SHIFT) & (xy < np.array([width, height]) - 1 - LARGEST_SHIFT)).all(axis=1)
-            moved.append(Edges(e.stamp, xy[inside], e.is_along_y[::2][inside], e.depth[::2][inside]))
+            moved.append(Edges(e.stamp, xy[inside], e.is_along_y[::2][inside], e.depth[::2][inside], e.outward[::2][inside]))
         places = _at_lag(colours, moved, 0.0)
         if len(places) >= LEAST_POINTS:
             scores = [_score(colours, places, dx, dy) for dx in _steps(3) for dy in _steps(3)]

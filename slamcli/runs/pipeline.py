@@ -13,7 +13,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from slamcli import __version__, files, interruption
+from slamcli import __version__, address_space, files, interruption
 from slamcli.config.options import Config
 from slamcli.console import Progress, Tell, silent, stage_line
 from slamcli.errors import SlamError
@@ -235,6 +235,7 @@ class Pipeline:
 
     def run_stage(self, stage: Stage, *, begun: Begun | None = None) -> None:
         """Run one stage, or end one that was begun elsewhere, and put its folder in place; if it fails, the result before stays."""
+        address_space.require()
         inputs = {name: self._present_input(name) for name in (*stage.needs, *staleness.named_files(stage, self.config))}
         tools = Tools(stage.name, self.config, self._progress)
         if stage is STAGES[0]:  # the record of the first stage is where the recording's own faults belong

@@ -4,11 +4,10 @@ from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from slamcli.config.options import ExtractConfig
-from slamcli.datasets import open_dataset
+from slamcli.datasets import images, open_dataset
 from slamcli.errors import BadFrame, SlamError
 from slamcli.parallel import ordered_map
 from slamcli.vision import orb
@@ -49,10 +48,5 @@ def _pictures(source: str, every: int) -> Iterable[Picture]:
 
 
 def _grey(path: Path) -> np.ndarray:
-    try:
-        grey = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-    except cv2.error as error:
-        raise BadFrame(f"{path}: cannot be decoded ({error.err})") from error
-    if grey is None:
-        raise BadFrame(f"{path}: not an image")
-    return grey
+    data = images.read_bytes(path)
+    return images.decode_grey(data, images.picture_size(data, str(path)), name=str(path))

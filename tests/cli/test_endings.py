@@ -2,6 +2,7 @@
 
 import os
 import resource
+import shutil
 import signal
 import subprocess
 import sys
@@ -144,6 +145,22 @@ def test_a_full_disk_stops_a_run_with_a_line_that_names_the_place(slamcli: Slamc
     assert "(File too large; choose" in error[0] and str(run) in error[0]
     assert {path: path.read_bytes() for path in before} == before
     assert not list(run.glob(".*.*"))
+
+
+@pytest.mark.parametrize("mebibytes", [640, 760, 1023])
+def test_a_run_begins_no_stage_where_libraries_could_end_it_without_a_word(room_run: Path, tmp_path: Path, mebibytes: int) -> None:
+    """Below a gibibyte of address space threads of C libraries abort, now and then; above, what lacks memory is told by our own."""
+    run, amount = Path(shutil.copytree(room_run, tmp_path / "run")), mebibytes << 20
+    done = subprocess.run(
+        [sys.executable, "-m", "slamcli", "run", "-r", str(run), "--from", "densify"],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+        capture_output=True,
+        text=True,
+        timeout=120,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (amount, amount)),
+    )
+    assert done.returncode == 1
+    assert f"Error: this process may reserve {mebibytes} MiB" in done.stderr and "ulimit -v unlimited" in done.stderr
 
 
 def test_too_few_descriptors_and_too_little_memory_are_told(room_run: Path, tmp_path: Path) -> None:

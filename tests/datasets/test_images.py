@@ -1,5 +1,6 @@
 """Decoding of single images: exact values, and BadFrame for whatever is wrong with a file."""
 
+import struct
 from pathlib import Path
 
 import cv2
@@ -8,6 +9,7 @@ import pytest
 from recordings import SIZE, colour, depth, png
 
 from slamcli.datasets import images
+from slamcli.datasets.image_header import image_size
 from slamcli.errors import BadFrame
 
 
@@ -62,15 +64,59 @@ def test_grey_picture_serves_as_colour(tmp_path: Path) -> None:
     assert np.array_equal(rgb(path)[..., 1], luma)
 
 
-@pytest.mark.parametrize(("suffix", "size"), [(".png", (64, 48)), (".jpg", (64, 48)), (".bmp", None)])
-def test_size_is_read_from_the_header(suffix: str, size: tuple[int, int] | None) -> None:
-    assert images.image_size(png(colour(), suffix)) == size
+SUFFIXES = (".png", ".jpg", ".bmp", ".tiff", ".ppm", ".pgm", ".webp")
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_size_is_read_from_the_header(suffix: str) -> None:
+    picture = colour() if suffix != ".pgm" else colour()[..., 0]
+    assert image_size(png(picture, suffix)) == (64, 48)
+
+
+def test_size_of_kinds_that_opencv_does_not_write() -> None:
+    assert image_size(b"P5 # a remark\n640\n# another\n480 255\n") == (640, 480)
+    assert image_size(b"Pf\n640 480\n-1.0\n") == (640, 480)
+    entries = [(256, 3, 1, 640 << 16), (257, 4, 1, 480)]  # a short stands in the first two bytes
+    assert image_size(b"MM\0*" + struct.pack(">IH", 8, 2) + b"".join(struct.pack(">HHII", *entry) for entry in entries)) == (640, 480)
+    assert image_size(b"BM" + bytes(12) + struct.pack("<IHH", 12, 640, 480)) == (640, 480)
+    assert image_size(b"BM" + bytes(12) + struct.pack("<Iii", 40, 640, -480)) == (640, 480)  # rows from the top
+    assert image_size(b"RIFF" + bytes(4) + b"WEBPVP8X" + bytes(8) + (639).to_bytes(3, "little") + (479).to_bytes(3, "little")) == (640, 480)
+    assert image_size(b"RIFF" + bytes(4) + b"WEBPVP8L" + bytes(4) + b"/" + struct.pack("<I", 639 | 479 << 14)) == (640, 480)
 
 
 @pytest.mark.parametrize("length", [0, 3, 8, 20, 100])
 def test_size_of_a_broken_header_is_unknown_or_right(length: int) -> None:
-    for suffix in (".png", ".jpg"):
-        assert images.image_size(png(colour(), suffix)[:length]) in (None, SIZE)
+    for suffix in SUFFIXES:
+        picture = colour() if suffix != ".pgm" else colour()[..., 0]
+        assert image_size(png(picture, suffix)[:length]) in (None, SIZE)
+
+
+@pytest.mark.parametrize(
+    "claim",
+    [
+        b"GIF89a" + struct.pack("<HH", 30000, 30000) + bytes(30),
+        b"II*\0" + struct.pack("<IHHHIIHHII", 8, 2, 256, 4, 1, 30000, 257, 4, 1, 30000),
+        b"II*\0" + struct.pack("<IHHHIIHHIIHHII", 8, 3, 256, 4, 1, 64, 257, 4, 1, 48, 256, 4, 1, 30000),
+        b"BM" + bytes(12) + struct.pack("<Iii", 40, 30000, 30000),
+        b"P5 30000 30000 255\n",
+        b"RIFF" + bytes(4) + b"WEBPVP8X" + bytes(8) + b"\xff" * 6,
+        b"\x00\x00\x00\x0cjP  \r\n\x87\n" + bytes(40),
+    ],
+    ids=["gif", "tiff", "tiff of two widths", "bmp", "pgm", "webp", "jpeg 2000"],
+)
+def test_no_decoder_is_asked_for_what_is_too_large_or_of_no_known_kind(claim: bytes, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("decoded"))
+    asked = (
+        lambda: images.decode_grey(claim, SIZE, name="x"),
+        lambda: images.decode_rgb(claim, SIZE, name="x"),
+        lambda: images.decode_depth(claim, SIZE, name="x"),
+        lambda: images.decode_depth(claim, name="x"),
+        lambda: images.decode_as_it_is(claim, name="x"),
+        lambda: images.picture_size(claim, "x"),
+    )
+    for decode in asked:
+        with pytest.raises(BadFrame, match=r"^x: (is |\d+ x \d+ px is too large)"):
+            decode()
 
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg"])

@@ -14,7 +14,15 @@ from slamcli.formats.trajectory import read_tum
 
 RECORDING = Path(__file__).parents[3] / "shared/data/tum/rgbd_dataset_freiburg1_xyz"
 FRAMES = (0, 300)
-RAW_COLOUR = ("ros1_raw", "ros1_lz4", "ros2_zstd", "mcap")  # pixels, whose luma is computed: as of a PNG, not as a JPEG has it stored
+RAW_COLOUR = (
+    "ros1_raw",
+    "ros1_lz4",
+    "ros1_rvl",
+    "ros2_raw",
+    "ros2_zstd",
+    "mcap_raw",
+    "mcap",
+)  # pixels, whose luma is computed: as of a PNG, not as a JPEG has it stored
 
 
 def content_of(dataset: Dataset, frames: tuple[int, ...], *, suffix: str) -> Content:

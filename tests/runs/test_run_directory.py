@@ -156,6 +156,16 @@ def test_a_broken_record_is_damage(run: RunDir, text: str | None, reason: str) -
     assert state(run, "loop") == ("damaged", reason)
 
 
+def test_a_file_in_the_place_of_a_stage_is_no_stage(run: RunDir, caplog: pytest.LogCaptureFixture) -> None:
+    """What was made from it can still be read, with a word."""
+    shutil.rmtree(run.path / "loop")
+    (run.path / "loop").write_text("mine")
+    assert run.stage_path("densify", "out.txt").is_file()
+    assert "densify is stale (input: loop is missing)" in caplog.text
+    with pytest.raises(SlamError, match="loop is not there any more"):
+        run.stage_path("loop")
+
+
 @pytest.mark.parametrize("entry", [{}, {"bytes": "64", "sha256": ""}, 3])
 def test_a_hostile_record_is_damage_and_no_traceback(run: RunDir, entry: object) -> None:
     record = run.record("loop")

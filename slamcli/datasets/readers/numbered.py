@@ -1,15 +1,17 @@
 """Colour and depth images with equal numbers in their names, or with time stamps for names; in two folders, or in one."""
 
+import contextlib
 import re
 from pathlib import Path
 
 import numpy as np
 
+from slamcli.datasets import images
 from slamcli.datasets.calibration import Calibration, find_calibration
 from slamcli.datasets.folder import COLOUR_FOLDERS, DEPTH_FOLDERS, DEPTH_SUFFIXES, IMAGE_SUFFIXES, Folder, number_of, numbered, subfolder
 from slamcli.datasets.recorded import Recorded, Stream
 from slamcli.datasets.sources import ConfidentDepth, ImageFiles
-from slamcli.errors import SlamError
+from slamcli.errors import BadFrame, SlamError
 
 CONFIDENCE = "confidence"
 LEAST_CONFIDENCE = {2: 2, 100: 100, 255: 255}  # by the largest value of an image: ARKit's levels and what programs make of them
@@ -102,16 +104,15 @@ def _stamped(
 
 def with_confidence(path: Path, folder: Folder, depth: ImageFiles, numbers: list[int]) -> tuple[ImageFiles | ConfidentDepth, list[str]]:
     """Lay a folder of confidence images over depth, where there is one: only the highest level counts."""
-    import cv2
-
     confidence = numbered(folder, CONFIDENCE, IMAGE_SUFFIXES)
     names = [confidence.get(number, "") for number in numbers]
     if not any(names):
         return depth, []
     highest = 0
     for name in [name for name in names if name][:: max(1, len(names) // 4)]:
-        image = cv2.imread(str(path / name), cv2.IMREAD_UNCHANGED)
-        highest = max(highest, int(image.max())) if image is not None else highest
+        with contextlib.suppress(BadFrame):  # it is told when its frame is read
+            image = images.decode_as_it_is(images.read_bytes(path / name), name=name)
+            highest = max(highest, int(image.max()))
     least = LEAST_CONFIDENCE.get(highest, highest)
     if least <= 0:
         return depth, []

@@ -3,12 +3,11 @@
 import struct
 from pathlib import Path
 
-import cv2
 import numpy as np
 
-from slamcli.datasets import png
+from slamcli.datasets import images, png
 from slamcli.datasets.calibration import Calibration
-from slamcli.datasets.images import JPEG_MAGIC
+from slamcli.datasets.image_header import JPEG_MAGIC
 from slamcli.datasets.intrinsics import COEFFICIENTS
 from slamcli.datasets.recorded import Recorded, Stream, truth_of_rows
 from slamcli.datasets.sqlite import Blobs, query
@@ -60,8 +59,8 @@ def decode_depth(data: bytes, name: str) -> bytes | np.ndarray:
     if data.startswith(INVERSE_MAGIC) and len(data) > 16:
         a, b = struct.unpack("<ff", data[8:16])
         inner = decode_depth(data[16:], name)
-        code = inner if isinstance(inner, np.ndarray) else cv2.imdecode(np.frombuffer(inner, np.uint8), cv2.IMREAD_UNCHANGED)
-        if code is None or code.dtype != np.uint16:
+        code = inner if isinstance(inner, np.ndarray) else images.decode_as_it_is(inner, name=name)
+        if code.dtype != np.uint16:
             raise BadFrame(f"{name}: is damaged")
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.where(code > 0, np.float32(a) / (code.astype(np.float32) - np.float32(b)), np.float32(0)).astype(np.float32)
@@ -71,8 +70,8 @@ def decode_depth(data: bytes, name: str) -> bytes | np.ndarray:
         except SlamError as error:
             raise BadFrame(f"{name}: {error}") from error
     if data.startswith(png.MAGIC) and len(data) > 26 and data[25] == 6:  # RGBA: four bytes of a float
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-        if image is None or image.ndim != 3 or image.shape[2] != 4 or image.dtype != np.uint8:
+        image = images.decode_as_it_is(data, name=name)
+        if image.ndim != 3 or image.shape[2] != 4 or image.dtype != np.uint8:
             raise BadFrame(f"{name}: is damaged")
         return np.ascontiguousarray(image).view(np.float32)[..., 0]
     if not data.startswith((png.MAGIC, JPEG_MAGIC)):
