@@ -15,7 +15,7 @@ from slamcli.geometry import se3
 from slamcli.geometry.algebra import product
 from slamcli.geometry.camera import Camera
 from slamcli.schema import Features, Words
-from slamcli.slam.background_step import Judgement, StepFinder, swerve
+from slamcli.slam.background_step import Judgement, StepFinder, is_poor, swerve
 
 SPACING = 0.35  # [s] from anchor to anchor: a walker has gone 0.3 m, ten times the noise of depth at 3 m
 SWERVE_COST, SWERVE_MOST = 0.1, 3.0  # share of the surface that a swerve is worth, and how many of them at most
@@ -43,6 +43,11 @@ class BackgroundMotion:
             scale.append(self._lasts(anchors, k) / self._lasts(anchors, k - 1) if k > 1 else 1.0)
             expected = [_scaled(one.T, scale[-1]) for one in steps[-1]] if steps else []
             steps.append(self._steps.candidates(anchors[k - 1], anchors[k], self._tried(anchors, k, before), expected))
+        # At its beginning, a recording has no step before that tells what to expect.
+        n_poor = next((k for k, found in enumerate(steps) if not is_poor(found[0])), 0)
+        for k in reversed(range(n_poor)):
+            expected = [_scaled(one.T, 1.0 / scale[k + 1]) for one in steps[k + 1]]
+            steps[k] = self._steps.more(anchors[k], anchors[k + 1], steps[k], expected)
         T_wc = np.tile(np.eye(4), (len(self._stamp), 1, 1))
         for k, T in enumerate(_steadiest(steps, scale), start=1):
             T_wc[anchors[k]] = product(T_wc[anchors[k - 1]], se3.inverse(T))

@@ -92,16 +92,15 @@ class StepFinder:
         """
         common = self._common(reference, i)
         found = self._refine_best(common, [*tried, *expected, *self._sampled(common)], LOOSE)
-        best = max(found, key=lambda one: one.score)
-        if not expected or best.explained < POOR_RATIO * best.contradicted or best.explained < POOR_SHARE:
+        if not expected or is_poor(max(found, key=_score)):
             around = [se3.exp(np.array([0.0, 0.0, z, 0.0, turn, 0.0])) for z in GRID_M for turn in GRID_RAD]
             start = expected[0] if expected else np.eye(4)
             found += self._refine_best(common, [product(step, start) for step in around], LOOSE)
-        kept: list[Judgement] = []
-        for one in sorted(found, key=lambda one: -one.score):
-            if len(kept) < CANDIDATES and all(swerve(one.T, other.T) > ALIKE for other in kept):
-                kept.append(one)
-        return kept
+        return _best_unlike(found)
+
+    def more(self, reference: int, i: int, found: list[Judgement], expected: list[np.ndarray]) -> list[Judgement]:
+        """Add to the motions found for a step those that are expected of it for another reason."""
+        return _best_unlike(found + self._refine_best(self._common(reference, i), expected, LOOSE))
 
     def near(self, reference: int, i: int, expected: np.ndarray) -> list[Judgement]:
         """Judge the motion expected from a frame to another near by, and refine it."""
@@ -205,6 +204,24 @@ class StepFinder:
             if len(self._frame_points) > KEPT:
                 self._frame_points.popitem(last=False)
         return self._frame_points[frame]
+
+
+def _score(one: Judgement) -> float:
+    return one.score
+
+
+def is_poor(best: Judgement) -> bool:
+    """Say whether a motion explains so little, or contradicts so much, that another may be the true one."""
+    return best.explained < POOR_RATIO * best.contradicted or best.explained < POOR_SHARE
+
+
+def _best_unlike(found: list[Judgement]) -> list[Judgement]:
+    """Keep the best motions, each unlike those before it."""
+    kept: list[Judgement] = []
+    for one in sorted(found, key=_score, reverse=True):
+        if len(kept) < CANDIDATES and all(swerve(one.T, other.T) > ALIKE for other in kept):
+            kept.append(one)
+    return kept
 
 
 def swerve(T: np.ndarray, expected: np.ndarray) -> float:

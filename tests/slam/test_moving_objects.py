@@ -16,7 +16,7 @@ from slamcli.geometry import se3
 from slamcli.schema import Features, Words
 from slamcli.slam import background_motion_kernels, depth_views, moving_object_kernels, moving_objects
 from slamcli.slam.background_motion import SWERVE_COST, SWERVE_MOST, BackgroundMotion, _steadiest, anchor_frames
-from slamcli.slam.background_step import FLATNESS, SWERVE_M, Judgement
+from slamcli.slam.background_step import FLATNESS, SWERVE_M, Judgement, StepFinder
 from slamcli.slam.depth_views import STEP, Views
 
 FRAMES, RATE, SPEED = 36, 15.0, 0.6
@@ -153,17 +153,21 @@ def test_hiding_takes_away_what_is_marked_and_no_more() -> None:
     assert moving_objects.hide_features(features, np.zeros((0, 0, 0), bool), KINECT) is features
 
 
-def test_the_motion_of_the_room_is_found_where_somebody_walks_along() -> None:
-    """Depth alone, no feature at all: half of the view keeps its place before the camera."""
-    views, truth = recording("walking")
-    assert truth.mean() > 0.2
+def without_texture(views: Views) -> tuple[Features, Words]:
     empty = {"xy": (0, 2), "depth": (0,), "slope": (0, 2), "octave": (0,), "angle": (0,), "desc": (0, 32)}
     kinds = {"octave": np.uint8, "desc": np.uint8}
     features = Features(
         stamp=views.stamp, depth_stamp=views.stamp, offset=np.zeros(FRAMES + 1, np.int64), octave_scale=np.float64(1.2),
         **{name: np.zeros(size, kinds.get(name, np.float32)) for name, size in empty.items()},
     )  # fmt: skip
-    words = Words(np.ones(1, np.float32), np.zeros(FRAMES + 1, np.int64), np.zeros(0, np.int32), np.zeros((0, 2), np.int32))
+    return features, Words(np.ones(1, np.float32), np.zeros(FRAMES + 1, np.int64), np.zeros(0, np.int32), np.zeros((0, 2), np.int32))
+
+
+def test_the_motion_of_the_room_is_found_where_somebody_walks_along() -> None:
+    """Depth alone, no feature at all: half of the view keeps its place before the camera."""
+    views, truth = recording("walking")
+    assert truth.mean() > 0.2
+    features, words = without_texture(views)
 
     def poses() -> np.ndarray:
         return BackgroundMotion(features, words, views.depth, KINECT, SensorConfig(), np.random.default_rng(0)).poses()
@@ -173,6 +177,24 @@ def test_the_motion_of_the_room_is_found_where_somebody_walks_along() -> None:
     true = se3.inverse(views.T_wc[0]) @ views.T_wc
     error = np.linalg.norm(found[:, :3, 3] - true[:, :3, 3], axis=1)
     assert np.linalg.norm(true[-1, :3, 3]) > 1.3 and error.max() < 0.08
+
+
+@pytest.mark.parametrize("share", [0.2, 0.9])
+def test_a_first_step_that_explains_little_is_judged_by_what_follows_it(monkeypatch: pytest.MonkeyPatch, share: float) -> None:
+    views, _ = recording("walking")
+    candidates = StepFinder.candidates
+
+    def with_the_walker_at_first(finder: StepFinder, reference: int, i: int, *others: list[np.ndarray]) -> list[Judgement]:
+        if reference > 0:
+            return candidates(finder, reference, i, *others)
+        return [Judgement(np.eye(4), score=share, explained=share, contradicted=0.0, agrees=np.zeros(0, dtype=bool))]
+
+    monkeypatch.setattr(StepFinder, "candidates", with_the_walker_at_first)
+    found = BackgroundMotion(*without_texture(views), views.depth, KINECT, SensorConfig(), np.random.default_rng(0)).poses()
+    true = se3.inverse(views.T_wc[0]) @ views.T_wc
+    first = anchor_frames(views.stamp, np.ones(FRAMES, dtype=bool))[1]
+    error = np.linalg.norm(found[first, :3, 3] - true[first, :3, 3])
+    assert error < 0.03 if share < 0.4 else error > 0.15  # what explains most of the view stays as it was found
 
 
 def test_the_room_speaks_for_its_own_motion_by_its_extent() -> None:
