@@ -532,6 +532,9 @@ LAYOUTS = (
     Layout("mcap", _ros(mcap, colour="rgb8", depth="rvl"), "rosbag"),
 )
 
+# Of which colour is pixels, whose luma is computed: as of a PNG, not as a JPEG has it stored.
+RAW_COLOUR = ("ros1_raw", "ros1_lz4", "ros1_rvl", "ros2_raw", "ros2_zstd", "mcap_raw", "mcap")
+
 
 def npy(array: np.ndarray) -> bytes:
     stream = io.BytesIO()

@@ -31,8 +31,9 @@ class Folder:
         Backslashes, another case, another suffix and paths of the machine that wrote the list are seen through; what leads out of the
         folder is refused with SlamError. `homes` are folders to look in where a bare name is not in the root.
         """
-        name = listed.strip().strip("\"'").replace("\\", "/")
-        windows, posix = PureWindowsPath(listed.strip()), PurePosixPath(name)
+        listed = listed.strip().strip("\"'").removeprefix("file://")
+        name = listed.replace("\\", "/")
+        windows, posix = PureWindowsPath(listed), PurePosixPath(name)
         if ".." in posix.parts:
             raise SlamError(f"{listed!r} leads out of the recording's folder")
         if posix.is_absolute() or windows.is_absolute() or windows.drive:

@@ -17,6 +17,7 @@ NOT_SQUARE, MIRRORED = 1e-3, 0.9  # by which a matrix differs from a rotation at
 MAX_BYTES = 1 << 20
 KEYS = "width height fx fy cx cy k1 k2 p1 p2 k3 depth_scale inverse_depth_offset k4 k5 k6 lens"
 DEPTH_KEYS = frozenset(["width", "height", "fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "lens"])
+FARTHEST_ASIDE = 1.0  # [m] of a depth camera from colour's, in one housing or on one robot's head
 POSE_KEYS = ("T_cd", "translation", "rotation")
 COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 # What other programs call our keys; compared without case, after the last dot of the name.
@@ -27,6 +28,10 @@ SYNONYMS = {
     "k1": ("k1",), "k2": ("k2",), "p1": ("p1",), "p2": ("p2",), "k3": ("k3",), "k4": ("k4",), "k5": ("k5",), "k6": ("k6",),
     "depth_scale": ("depth_scale", "scale", "png_depth_scale", "depthmapfactor", "depth_factor", "depth_map_factor", "depthscale"),
 }  # fmt: skip
+PAIRS = {  # of both axes
+    ("fx", "fy"): ("focal_length", "focallength", "focal", "focal_lengths"),
+    ("cx", "cy"): ("principal_point", "principalpoint", "optical_center", "optical_centre"),
+}
 MATRICES = ("intrinsic_matrix", "k", "camera_matrix", "intrinsics", "intrinsic", "intrinsic_k", "cam_k", "camera_intrinsic")
 EQUIDISTANT_NAMES = ("equidistant", "fisheye", "kannala_brandt", "kannala_brandt4", "opencv_fisheye")
 POLYNOMIAL_NAMES = ("", "none", "plumb_bob", "rational_polynomial", "rational", "radtan", "opencv", "brown_conrady", "modified_brown_conrady",
@@ -134,6 +139,10 @@ def _scalars(flat: Mapping[str, Any]) -> dict[str, Any]:
         value = next((flat[name] for name in names if isinstance(flat.get(name), (int, float)) and not isinstance(flat[name], bool)), None)
         if value is not None:
             found[key] = value
+    for keys, names in PAIRS.items():
+        both = next((numbers for name in names if len(numbers := _flat(flat.get(name))) == 2), None)
+        if both is not None:
+            found = {**dict(zip(keys, both, strict=True)), **found}
     if 0 < found.get("depth_scale", 1.0) < 0.5:  # metres per unit
         found["depth_scale"] = 1.0 / found["depth_scale"]
     if "fy" in found:
@@ -206,6 +215,8 @@ def _pose(depth: Mapping[str, Any], path: Path) -> np.ndarray | None:
         or not product(np.cross(T_cd[:3, 0], T_cd[:3, 1]), T_cd[:3, 2]) > MIRRORED
     ):
         raise SlamError(f"{path}: the rotation of the depth camera is none")
+    if not np.square(T_cd[:3, 3]).sum() < FARTHEST_ASIDE**2:
+        raise SlamError(f"{path}: depth.translation is farther than {FARTHEST_ASIDE:g} m; give it in metres, not in millimetres")
     return T_cd
 
 

@@ -3,6 +3,7 @@
 import math
 import re
 from dataclasses import dataclass, field
+from datetime import datetime
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +23,10 @@ STAMP_FIRST = (
 )
 STAMP_LAST = re.compile(rf"\s*(\S.*?)\s*[,;\s]\s*[\"']?({DECIMAL_COMMA}|{NUMBER})[\"']?\s*$", re.IGNORECASE)
 WHOLE_NUMBER = re.compile(rf"[\"']?({DECIMAL_COMMA}|{NUMBER})[\"']?$", re.IGNORECASE)
+DATE = re.compile(
+    r"(?<![^\s,;\"'])(\d{4}-\d\d-\d\d)[T ](\d\d:\d\d:\d\d)(?:[.,](\d+))?(Z|[+-]\d\d:?\d\d)?(?=[\s,;\"']|$)"  # as ISO 8601 writes it
+)
+BRACKETS = {"(": ")", "[": "]", "{": "}"}
 LARGEST_STAMP = 1e19  # [ns] since 1970, in the year 2286; no stamp in any unit is larger
 EARLIEST, NANOSECONDS = 5e8, 1e9  # [s] since 1970 of any recording; in a second
 POSE_COLUMNS = 8  # stamp tx ty tz qx qy qz qw
@@ -111,7 +116,24 @@ def read_pairs(path: Path, folder: Folder | None = None) -> PairList:
 def data_lines(path: Path) -> list[tuple[int, str]]:
     """Return (line number, text) of the lines that hold data."""
     lines = enumerate(read_text(path).splitlines(), start=1)
-    return [(number, line[:MAX_LINE]) for number, line in lines if line.strip() and not line.lstrip().startswith("#")]
+    return [(number, _plain(line[:MAX_LINE])) for number, line in lines if line.strip() and not line.lstrip().startswith("#")]
+
+
+def _plain(line: str) -> str:
+    """Return a line without brackets around it, with semicolons for upright bars and seconds since 1970 for dates."""
+    text = line.strip().rstrip(",")
+    if text and BRACKETS.get(text[0]) == text[-1]:
+        line = text[1:-1]
+    return DATE.sub(_seconds, line.replace("|", ";"))
+
+
+def _seconds(date: re.Match) -> str:
+    day, time, fraction, zone = date.groups()
+    try:
+        moment = datetime.fromisoformat(f"{day}T{time}{zone or 'Z'}")
+    except ValueError:  # a month 13
+        return str(date.group())
+    return f"{round(moment.timestamp())}.{fraction or '0'}"
 
 
 def read_text(path: Path) -> str:

@@ -147,8 +147,7 @@ def find(dataset: Dataset, *, workers: int = 2) -> DepthCamera | None:
     _, near, overlay = max(tried, key=lambda one: (1.0 - LAG_PRICE * abs(one[0])) * one[2].contrast(one[1]))
     overlay.blur(0.0)
     found, information = _align(overlay, near, dataset.camera)
-    contrast, before = overlay.contrast(found), overlay.contrast(as_it_is)
-    return DepthCamera(found, information, contrast, before, float(dataset.camera.fx))
+    return DepthCamera(found, information, overlay.contrast(found), overlay.contrast_as_it_is, float(dataset.camera.fx))
 
 
 def _like_colour(camera: Camera) -> np.ndarray:
@@ -181,7 +180,14 @@ class _Overlay:
 
     def contrast(self, numbers: np.ndarray) -> float:
         """Return the mean steepness under the edges over that of the pictures; what falls outside counts as the mean."""
-        xy = self.moved(numbers)
+        return self._contrast(self.moved(numbers))
+
+    @property
+    def contrast_as_it_is(self) -> float:
+        """Return that contrast with depth where it lies."""
+        return self._contrast(self._carried(self._xy))
+
+    def _contrast(self, xy: np.ndarray) -> float:
         return float(np.where(self.is_inside(xy, 1.0), self._steep(xy), self._mean).mean()) / self._mean
 
     def profile(self, xy: np.ndarray, ticks: np.ndarray) -> np.ndarray:
@@ -211,7 +217,10 @@ class _Overlay:
         """Return the raw pixels (N, 2) of the pictures in which the edges lie."""
         ray = np.concatenate([(self._xy - numbers[CENTRE]) / np.exp(numbers[FOCAL]), np.ones_like(self._z)], axis=1)
         x_c = se3.transform(transform(numbers[TURN], numbers[OFFSET]), ray * self._z)
-        xy = self._camera.distort(self._camera.project(x_c))
+        return self._carried(self._camera.distort(self._camera.project(x_c)))
+
+    def _carried(self, xy: np.ndarray) -> np.ndarray:
+        """Carry places (N, 2) with the pictures' motion from the time of their depth to that of their picture."""
         size = np.array(self._velocity.shape[2:0:-1]) - 1
         small = np.clip(np.nan_to_num(xy / self._colours.reduction), 0, size).astype(np.int64)
         return xy + self._velocity[self._picture, small[:, 1], small[:, 0]] * self._seconds

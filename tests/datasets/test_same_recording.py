@@ -7,22 +7,13 @@ import cv2
 import layouts
 import numpy as np
 import pytest
-from layouts import LAYOUTS, Content, Layout
+from layouts import LAYOUTS, RAW_COLOUR, Content, Layout
 
 from slamcli.datasets import Dataset, open_dataset
 from slamcli.formats.trajectory import read_tum
 
 RECORDING = Path(__file__).parents[3] / "shared/data/tum/rgbd_dataset_freiburg1_xyz"
 FRAMES = (0, 300)
-RAW_COLOUR = (
-    "ros1_raw",
-    "ros1_lz4",
-    "ros1_rvl",
-    "ros2_raw",
-    "ros2_zstd",
-    "mcap_raw",
-    "mcap",
-)  # pixels, whose luma is computed: as of a PNG, not as a JPEG has it stored
 
 
 def content_of(dataset: Dataset, frames: tuple[int, ...], *, suffix: str) -> Content:
