@@ -49,7 +49,8 @@ def save(value: Any, folder: Path) -> None:
         column = _narrowest(np.asarray(getattr(value, spec.name), order="C"), spec.metadata["narrow"])
         header = io.BytesIO()
         np.lib.format.write_array_header_1_0(header, np.lib.format.header_data_from_array_1_0(column))
-        files.write_new(path, memoryview(header.getvalue()), column.reshape(-1).view(np.uint8).data)  # numpy's own way hides why a write fails
+        data = column.reshape(-1).view(np.uint8).data  # numpy's own way hides why a write fails
+        files.write_new(path, memoryview(header.getvalue()), data)
 
 
 def _narrowest(column: np.ndarray, narrow: Sequence[np.dtype]) -> np.ndarray:
