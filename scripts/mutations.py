@@ -55,12 +55,24 @@ COMPILING = 60.0  # [s]
 
 
 @dataclass(frozen=True)
-class Mutant:
-    """A module's source, changed in one place."""
+class Change:
+    """What one of cosmic-ray's operators does at one place of a source."""
 
-    source: str
-    line: int  # from 1
-    place: tuple  # start and end of what was changed
+    operator: str
+    number: int  # of the place, among those that the operator finds
+    place: tuple  # start and end of what is changed
+
+    @property
+    def line(self) -> int:
+        """Return the line, from 1."""
+        return int(self.place[0][0])
+
+    def applied(self, source: str) -> str:
+        """Return the source with the change; the source itself where the operator changes nothing there."""
+        import cosmic_ray.plugins
+        from cosmic_ray.mutating import mutate_code
+
+        return mutate_code(source, cosmic_ray.plugins.get_operator(self.operator)(), self.number) or source
 
 
 def main() -> None:
@@ -97,55 +109,55 @@ def try_module(copy: Path, module: str, arguments: argparse.Namespace) -> None:
         sys.exit(f"{module}: the tests fail without any mutation: see {log}" if arguments.folder else log.read_text())
     timeout = COMPILING + SLOWER * (time.monotonic() - started)
     drawn = draw(original, random.Random(arguments.seed))
-    numbers = arguments.only or range(min(arguments.number, len(drawn)))
-    survivors = 0
-    for number in numbers:
-        mutant = drawn[number]
-        file.write_text(mutant.source)
+    tried = survivors = 0
+    for number in arguments.only or range(len(drawn)):
+        mutated = drawn[number].applied(original)
+        if mutated == original:
+            continue
+        file.write_text(mutated)
         try:
-            survived = in_fork(functools.partial(run_mutant, mutant, original, order), log=log, timeout=timeout)
+            survived = in_fork(functools.partial(run_mutant, drawn[number], original, order), log=log, timeout=timeout)
         finally:
             file.write_text(original)
         if survived:
             survivors += 1
-            diff = difflib.unified_diff(original.splitlines(), mutant.source.splitlines(), module, module, n=0, lineterm="")
+            diff = difflib.unified_diff(original.splitlines(), mutated.splitlines(), module, module, n=0, lineterm="")
             print("\n".join([f"{number}:", *itertools.islice(diff, 2, None)]), flush=True)
+        tried += 1
+        if tried == arguments.number:
+            break
     spent = resource.getrusage(resource.RUSAGE_CHILDREN)
-    seconds = (spent.ru_utime + spent.ru_stime) / len(numbers)
-    print(f"{module}: {len(numbers) - survivors} of {len(numbers)} mutants noticed, {seconds:.1f} s of CPU time each", flush=True)
+    seconds = (spent.ru_utime + spent.ru_stime) / max(tried, 1)
+    print(f"{module}: {tried - survivors} of {tried} mutants noticed, {seconds:.1f} s of CPU time each", flush=True)
 
 
-def draw(source: str, rng: random.Random) -> list[Mutant]:
-    """Shuffle all mutants so that each place is changed once before any is changed twice."""
-    mutants = list(all_mutants(source))
-    rng.shuffle(mutants)
+def draw(source: str, rng: random.Random) -> list[Change]:
+    """Shuffle all changes so that each place is changed once before any is changed twice."""
+    changes = list(all_changes(source))
+    rng.shuffle(changes)
     seen: dict[tuple, int] = {}
     turn = []
-    for mutant in mutants:
-        turn.append(seen.get(mutant.place, 0))
-        seen[mutant.place] = turn[-1] + 1
-    return [mutants[k] for k in sorted(range(len(mutants)), key=lambda k: turn[k])]
+    for change in changes:
+        turn.append(seen.get(change.place, 0))
+        seen[change.place] = turn[-1] + 1
+    return [changes[k] for k in sorted(range(len(changes)), key=lambda k: turn[k])]
 
 
-def all_mutants(source: str) -> Iterator[Mutant]:
-    """Yield the mutants of a source, but for those that cannot behave differently."""
+def all_changes(source: str) -> Iterator[Change]:
+    """Yield the changes of a source, but for those that cannot make it behave differently."""
     import cosmic_ray.plugins
     from cosmic_ray.ast import ast_nodes, get_ast
-    from cosmic_ray.mutating import mutate_code
 
     dull, signatures = where_types_stand(source), where_arguments_stand(source)
+    nodes = list(ast_nodes(get_ast(source)))
     for name in cosmic_ray.plugins.operator_names():
         kind = cosmic_ray.plugins.get_operator(name)
         if kind.arguments() or name == "core/RemoveDecorator":
             continue
-        nodes = ast_nodes(get_ast(source))
+        skipped = dull + signatures if "BinaryOperator" in name else dull
         for k, place in enumerate(position for node in nodes for position in kind().mutation_positions(node)):
-            skipped = dull + signatures if "BinaryOperator" in name else dull
-            if any(a <= place[0] < b for a, b in skipped):
-                continue
-            mutated = mutate_code(source, kind(), k)
-            if mutated is not None and mutated != source:
-                yield Mutant(mutated, place[0][0], place)
+            if not any(a <= place[0] < b for a, b in skipped):
+                yield Change(name, k, place)
 
 
 def where_arguments_stand(source: str) -> list[tuple[tuple[int, int], tuple[int, int]]]:
@@ -190,11 +202,11 @@ def import_all_but(module: str) -> None:
     cache._digest(str(Path(f"{module.replace('.', '/')}.py").absolute()))  # mutants outside kernels find these compiled
 
 
-def run_mutant(mutant: Mutant, original: str, order: Path) -> None:
+def run_mutant(change: Change, original: str, order: Path) -> None:
     """Run the tests of a mutant whose file is in place, in the order noted."""
     from slamcli.jit import cache
 
-    if is_in_kernel(original, mutant.line):
+    if is_in_kernel(original, change.line):
         cache._digest.cache_clear()
         cache.KernelCache.save_overload = lambda *_: None  # type: ignore[method-assign]
     run_tests(order.read_text().splitlines())
