@@ -148,6 +148,19 @@ def test_under_a_table_top_near_its_edge_a_cell_whose_floor_two_views_saw_is_occ
         assert made.p_occupied[4, 0] == pytest.approx(grid.INSIDE) and made.n_seen[4, 0] == n_under
 
 
+@pytest.mark.parametrize("to", [(1, 0), (-1, 0), (0, 1), (0, -1)])
+@pytest.mark.parametrize(("behind", "expected"), [(20, UNKNOWN), (22, FREE)])
+def test_what_hangs_may_go_on_for_a_metre_behind_its_face_in_every_direction(to, behind, expected):
+    """DEEPEST is twenty cells; the outline of a face is one cell wider on either side."""
+    along, middle = np.array(to), np.array([100, 100])
+    camera = (*((middle - 40 * along + 0.5) * 0.05), 0.6)
+    face = view([middle + k * along[::-1] for k in range(-4, 5)], n=20, camera=camera, slices=0xF000)
+    under = middle + behind * along
+    made = fuse([face, view([under], floor=SEEN, camera=camera)] * 3, settings=SETTINGS)
+    column, row = under - np.round(made.origin / 0.05).astype(int)
+    assert made.state[row, column] == expected
+
+
 def test_an_outline_is_closed_by_the_four_cells_beside_each_and_no_others():
     standing = np.zeros((5, 6), np.uint16)
     standing[2, 3], standing[0, 0], standing[4, 5] = 0b0110, 0b1000, 0b0001
