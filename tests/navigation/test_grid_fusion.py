@@ -52,6 +52,12 @@ def test_floor_that_was_seen_or_passed_close_above_is_free(floor, expected):
     assert state([view([4, 4], floor=floor)] * 3) == [[expected]]
 
 
+@pytest.mark.parametrize("update", ["evidence", "paper"])
+def test_each_view_that_tells_of_a_cell_counts_once(update):
+    made = fuse([view([4, 4], floor=SEEN)] * 3 + [view([4, 4], n=9), view([4, 4])], settings=replace(SETTINGS, update=update))
+    assert made.n_seen.tolist() == [[4]]
+
+
 @pytest.mark.parametrize(
     ("n_hole", "n_floor", "is_hole"),
     [(1, 0, False), (2, 0, True), (1, 2, False), (2, 4, True), (2, 5, False), (3, 6, True), (3, 7, False)],
