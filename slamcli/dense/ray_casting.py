@@ -6,6 +6,8 @@ A. Hornung et al., OctoMap, Autonomous Robots 2013, doi:10.1007/s10514-012-9321-
 float, follows its `computeUpdate` and `computeRayKeys`, so that maps agree cell by cell.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import b1, f4, f8, i8, u1
 
@@ -17,6 +19,25 @@ from slamcli.jit.kernel import kernel
 MAX_MARKS = 1 << 30  # cells of one scan's bounding box, a byte each
 FREE, OCCUPIED = 1, 2  # marks
 ROUNDING = 1e-9  # relative; far above what some hundred additions of float64 can lose, far below what a ray's path depends on
+
+
+class _Rays(NamedTuple):
+    """The rays of a scan."""
+
+    end: f4[:, ::1]  # (N, 3) [m]
+    end_cell: i8[:, ::1]  # (N, 3)
+    t_next: f8[:, ::1]  # (3, N) [m] per axis, length at which the first face of a cell is crossed
+    t_cell: f8[:, ::1]  # (3, N) [m] and from face to face
+    reach: f4[::1]  # (N,) [m] length of each
+
+
+class _Scan(NamedTuple):
+    """Where the rays of a scan begin, and the cells in which it is marked."""
+
+    origin: f4[::1]  # (3,) [m]
+    resolution: f8  # [m]
+    lower: i8[::1]  # (3,) first cell
+    shape: i8[::1]  # (3,) cells along x, y and z
 
 
 def mark_scan(
@@ -44,7 +65,7 @@ def mark_scan(
     marks = np.zeros(shape[::-1], dtype=np.uint8)
     t_next, t_cell, reach = np.empty((3, n)), np.empty((3, n)), np.empty(n, dtype=np.float32)
     _ray_times(end[:n], origin, resolution, t_next, t_cell, reach)
-    _cast_rays(end[:n], end_cell[:n], t_next, t_cell, reach, origin, resolution, lower, shape, marks.reshape(-1))
+    _cast_rays(_Rays(end[:n], end_cell[:n], t_next, t_cell, reach), _Scan(origin, resolution, lower, shape), marks.reshape(-1))
     _mark_ends(end_cell[:n], is_hit[:n], lower, marks)
     return marks, lower
 
@@ -113,22 +134,13 @@ def _ray_times(end: f4[:, ::1], origin: f4[::1], resolution: f8, t_next: f8[:, :
 
 
 @kernel
-def _cast_rays(
-    end: f4[:, ::1],
-    end_cell: i8[:, ::1],
-    t_next: f8[:, ::1],
-    t_cell: f8[:, ::1],
-    reach: f4[::1],
-    origin: f4[::1],
-    resolution: f8,
-    lower: i8[::1],
-    shape: i8[::1],
-    marks: u1[::1],
-):
+def _cast_rays(rays: _Rays, scan: _Scan, marks: u1[::1]):
     """Mark the cells that rays pass, without their end cells.
 
     Axis c is the one along which a ray crosses most faces. Rays on which rounding might matter are walked from face to face.
     """
+    _, end_cell, t_next, t_cell, reach = rays
+    origin, resolution, lower, shape = scan
     factor = 1.0 / resolution
     start_x, start_y, start_z = int(np.floor(factor * origin[0])), int(np.floor(factor * origin[1])), int(np.floor(factor * origin[2]))
     start_cell = (start_x + CENTRE, start_y + CENTRE, start_z + CENTRE)
@@ -153,16 +165,17 @@ def _cast_rays(
         elif cb < cc:
             axis_c = 1
             sb, sc, nb, nc, tb, tc, cb, cc = sc, sb, nc, nb, tc, tb, cc, cb
-        if not _is_regular(ta, tb, tc, ca, cb, cc, na, nb, nc, np.float64(reach[i])):
-            _walk(start_cell, end_cell[i], origin, end[i], t_next[:, i], t_cell[:, i], np.float64(reach[i]), lower, shape, marks)
+        t, per_cell, step = (ta, tb, tc), (ca, cb, cc), (sa, sb, sc)
+        if not _is_regular(t, per_cell, (na, nb, nc), np.float64(reach[i])):
+            _walk(start_cell, rays, i, scan, marks)
             continue
         # Where a ray runs through an edge, the face of the later axis comes first. As constants these cost nothing.
         if axis_c == 2:
-            at, ta, tb = _march(start, nc, ta, tb, tc, ca, cb, cc, sa, sb, sc, False, False, marks)
+            at, ta, tb = _march(start, nc, t, per_cell, step, False, False, marks)
         elif axis_c == 1:
-            at, ta, tb = _march(start, nc, ta, tb, tc, ca, cb, cc, sa, sb, sc, False, True, marks)
+            at, ta, tb = _march(start, nc, t, per_cell, step, False, True, marks)
         else:
-            at, ta, tb = _march(start, nc, ta, tb, tc, ca, cb, cc, sa, sb, sc, True, True, marks)
+            at, ta, tb = _march(start, nc, t, per_cell, step, True, True, marks)
         stop = _flat(end_cell[i, 0] - lower[0], end_cell[i, 1] - lower[1], end_cell[i, 2] - lower[2], shape)
         if at != stop:
             marks[at] = FREE
@@ -171,14 +184,17 @@ def _cast_rays(
 
 
 @kernel
-def _march(at, n, ta, tb, tc, ca, cb, cc, sa, sb, sc, a_before_c, b_before_c, marks):
+def _march(at, n, t, per_cell, step, a_before_c, b_before_c, marks):
     """Mark the cells along n faces of axis c, of which none of axis a or b crosses more.
 
     Between two faces of axis c a ray crosses at most one of a and one of b. So no round of the loop has a branch to mispredict: twice as
     fast as a walk from face to face, and the same cells, for the same comparisons are made.
 
-    at, sa, sb, sc : place in `marks` and the steps along the axes; ta.. : length of the ray to the next face; ca.. : between faces
+    at : place in `marks`. Along axes a, b and c: t, lengths of the ray to the next face; per_cell, between faces; step, in `marks`
     """
+    ta, tb, tc = t
+    ca, cb, cc = per_cell
+    sa, sb, sc = step
     nothing = np.uint64(0)
     for _ in range(n):
         is_a = ta <= tc if a_before_c else ta < tc
@@ -201,8 +217,11 @@ def _flat(x, y, z, shape):
 
 
 @kernel
-def _is_regular(ta, tb, tc, ca, cb, cc, na, nb, nc, reach):
-    """Say whether the walk reaches its end cell by as many faces as lie between, clear of rounding."""
+def _is_regular(t, per_cell, n_faces, reach):
+    """Say whether the walk reaches its end cell by as many faces as lie between, clear of rounding; arguments along axes a, b and c."""
+    ta, tb, tc = t
+    ca, cb, cc = per_cell
+    na, nb, nc = n_faces
     slack = ROUNDING * reach
     first, last = reach - slack, reach + slack
     return (
@@ -218,13 +237,15 @@ def _is_regular(ta, tb, tc, ca, cb, cc, na, nb, nc, reach):
 
 
 @kernel
-def _walk(start_cell, end_cell, origin, end, t_next, t_cell, reach, lower, shape, marks):
-    """Mark the cells of one ray from face to face, by OctoMap's rules for ties and for rays that miss their end cell.
+def _walk(start_cell, rays, i, scan, marks):
+    """Mark the cells of ray `i` from face to face, by OctoMap's rules for ties and for rays that miss their end cell.
 
     J. Amanatides and A. Woo, A fast voxel traversal algorithm for ray tracing, Eurographics 1987.
     """
+    end, end_cell, t_cell, reach = rays.end[i], rays.end_cell[i], rays.t_cell[:, i], np.float64(rays.reach[i])
+    origin, _, lower, shape = scan
     x, y, z = start_cell[0], start_cell[1], start_cell[2]
-    tx, ty, tz = t_next[0], t_next[1], t_next[2]
+    tx, ty, tz = rays.t_next[0, i], rays.t_next[1, i], rays.t_next[2, i]
     while True:
         marks[_flat(x - lower[0], y - lower[1], z - lower[2], shape)] = FREE
         if tx < ty and tx < tz:

@@ -71,6 +71,33 @@ def sharpness(grey: np.ndarray) -> float:
     return float(np.abs(cv2.Laplacian(image, cv2.CV_32F)).mean(dtype=np.float64) / max(change, 1.0))
 
 
+class Surface(NamedTuple):
+    """M triangles and the N texels on them, sorted by triangle."""
+
+    first: i4[::1]  # (M + 1,) row of each triangle's first texel
+    corner: f4[:, :, ::1]  # (M, 3, 3) [m]
+    normal: f4[:, ::1]  # (M, 3)
+    xyz: f4[:, ::1]  # (N, 3) [m] of the texels
+
+
+class Shown(NamedTuple):
+    """What a view shows, without a lens's distortion."""
+
+    rgb: u1[:, :, ::1]  # (H, W, 3)
+    depth: f4[:, ::1]  # (H, W) [m], 0 = none
+    near: f4[:, ::1]  # (H, W) [m] the least readings around each pixel
+    T_cw: f8[:, ::1]  # (4, 4)
+    centre: f8[::1]  # (3,) [m] of the camera, in the mesh's frame
+    quality: f8
+
+
+class Paint(NamedTuple):
+    """What views have given to N texels."""
+
+    total: f4[:, ::1]  # (N, 3) colours times weights
+    weight: f4[::1]  # (N,)
+
+
 class Painter:
     """A texture in the making: views are added one at a time."""
 
@@ -85,16 +112,16 @@ class Painter:
         of = owner.ravel()[texel]
         order = np.argsort(of, kind="stable")
         self._texel, of = texel[order].astype(np.int32), of[order]
-        self._first = np.searchsorted(of, np.arange(len(uv) + 1)).astype(np.int32)
+        first = np.searchsorted(of, np.arange(len(uv) + 1)).astype(np.int32)
         share = np.empty((len(of), 3), dtype=np.float32)
-        _weigh_corners(uv, self._texel, self._first, size, share)
-        self._corner = np.ascontiguousarray(mesh.xyz[mesh.triangle])
-        a, b, c = self._corner.transpose(1, 0, 2).astype(np.float64)
+        _weigh_corners(uv, self._texel, first, size, share)
+        corner = np.ascontiguousarray(mesh.xyz[mesh.triangle])
+        a, b, c = corner.transpose(1, 0, 2).astype(np.float64)
         normal = np.cross(b - a, c - a)
-        self._normal = (normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)).astype(np.float32)
-        self._xyz = _mixed(self._corner, share, of)
+        normal = (normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)).astype(np.float32)
+        self._surface = Surface(first, corner, normal, _mixed(corner, share, of))
         self._plain = _mixed(mesh.rgb[mesh.triangle].astype(np.float32), share, of)
-        self._total, self._weight = np.zeros((len(of), 3), np.float32), np.zeros(len(of), np.float32)
+        self._paint = Paint(np.zeros((len(of), 3), np.float32), np.zeros(len(of), np.float32))
 
     def add(self, rgb: np.ndarray, depth: np.ndarray, T_wc: np.ndarray, *, quality: float) -> None:
         """Paint what one view sees.
@@ -110,21 +137,22 @@ class Painter:
             depth = cv2.remap(depth, *self._raw, cv2.INTER_NEAREST)
         near = cv2.erode(np.where(depth > 0, depth, np.float32(np.inf)), np.ones((2 * EDGE + 1,) * 2, np.uint8))
         T_cw, centre = np.ascontiguousarray(se3.inverse(T_wc)), np.ascontiguousarray(T_wc[:3, 3])
-        seen = self._first, self._corner, self._normal, self._xyz
-        _paint(*seen, rgb, depth, near, T_cw, centre, self._pinhole, float(quality), self._total, self._weight)
+        _add(self._surface, Shown(rgb, depth, near, T_cw, centre, float(quality)), self._pinhole, self._paint)
 
     def covered(self) -> float:
         """Return the share of the surface's area in [0, 1] that views have painted."""
         area = triangle_areas(self._mesh)
-        n = np.diff(self._first)
-        painted = np.add.reduceat(np.append(self._weight > 0, False).astype(np.int64), self._first[:-1]) * (n > 0)
+        first, weight = self._surface.first, self._paint.weight
+        n = np.diff(first)
+        painted = np.add.reduceat(np.append(weight > 0, False).astype(np.int64), first[:-1]) * (n > 0)
         return float((area * painted / np.maximum(n, 1)).sum() / max(area[n > 0].sum(), 1e-12))
 
     def textured(self) -> Textured:
         """Return the mesh with its picture; where no view reached, the picture shows the vertices' colours."""
         import cv2
 
-        mean = np.where(self._weight[:, None] > 0, self._total / np.maximum(self._weight, 1e-30)[:, None], self._plain)
+        total, weight = self._paint.total, self._paint.weight[:, None]
+        mean = np.where(weight > 0, total / np.maximum(weight, 1e-30), self._plain)
         picture = np.full((self._size * self._size, 3), BACKGROUND, dtype=np.uint8)
         picture[self._texel] = np.clip(np.rint(mean), 0, 255).astype(np.uint8)
         is_empty = np.ones(self._size * self._size, dtype=np.uint8)
@@ -200,26 +228,11 @@ def _shares(x, y, x0, y0, x1, y1, x2, y2, area):
 
 
 @kernel
-def _paint(
-    first: i4[::1],
-    corner: f4[:, :, ::1],
-    normal: f4[:, ::1],
-    xyz: f4[:, ::1],
-    rgb: u1[:, :, ::1],
-    depth: f4[:, ::1],
-    near: f4[:, ::1],
-    T: f8[:, ::1],
-    centre: f8[::1],
-    camera: Pinhole,
-    quality: f8,
-    total: f4[:, ::1],
-    weight: f4[::1],
-):
-    """Add to the texels at xyz (N, 3) the colours that a view has of them, times its weight.
-
-    first : (M + 1,) rows of each triangle's texels; corner : (M, 3, 3), normal : (M, 3) of the triangles
-    depth, near : (H, W) [m], 0 = none: readings, and the least ones around each pixel; T : (4, 4) to the camera's frame
-    """
+def _add(surface: Surface, shown: Shown, camera: Pinhole, paint: Paint):
+    """Add to the texels the colours that a view has of them, times its weight."""
+    first, corner, normal, xyz = surface
+    rgb, depth, near, T, centre, quality = shown
+    total, weight = paint
     fx, fy, cx, cy = camera
     height, width = depth.shape
     for m in range(len(first) - 1):

@@ -128,7 +128,7 @@ def test_texels_and_paint_match_their_slow_twins():
     painter.add(rgb, depth, T, quality=0.9)
     T_cw, n = np.linalg.inv(T), 0
     for m, corners in enumerate(uv * 24.0):
-        for row in range(painter._first[m], painter._first[m + 1]):
+        for row in range(painter._surface.first[m], painter._surface.first[m + 1]):
             at = np.array([painter._texel[row] % 24 + 0.5, painter._texel[row] // 24 + 0.5])
             share = np.linalg.solve(np.vstack([corners.T, np.ones(3)]), [*at, 1.0])
             assert share.min() > -1e-4
@@ -147,7 +147,7 @@ def test_texels_and_paint_match_their_slow_twins():
                     i, j, b, a = int(v), int(u), u - int(u), v - int(v)
                     square = rgb[i : i + 2, j : j + 2].astype(float)
                     colour = np.einsum("i,j,ijk->k", [1 - a, a], [1 - b, b], square) * weight
-            np.testing.assert_allclose(painter._weight[row], weight, rtol=2e-3, atol=1e-6)
-            np.testing.assert_allclose(painter._total[row], colour, rtol=2e-2, atol=0.05)
+            np.testing.assert_allclose(painter._paint.weight[row], weight, rtol=2e-3, atol=1e-6)
+            np.testing.assert_allclose(painter._paint.total[row], colour, rtol=2e-2, atol=0.05)
             n += weight > 0
     assert 40 < n < len(painter._texel)

@@ -1,6 +1,7 @@
 """Draw figures over a rendered room: every part is a ray-cast ellipsoid or box, and the nearer of it and the room is seen."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -24,6 +25,41 @@ class Drawn:
     owner: np.ndarray  # (H, W) uint8, 1 + the figure that a pixel shows, 0 = the room
 
 
+class _Parts(NamedTuple):
+    """The parts of all figures, P of them."""
+
+    half: f8[:, ::1]  # (P, 3) [m] half axes, or half sides
+    kind: i4[::1]  # (P,)
+    owner: i4[::1]  # (P,) 1 + the figure that each belongs to
+
+
+class _Pictures(NamedTuple):
+    """What is painted on the parts, each in several sizes."""
+
+    level: i8[::1]  # (P + 1,) number of each part's first size
+    size: i8[:, ::1]  # (M, 2) rows and columns
+    start: i8[::1]  # (M,) row of each one's first pixel
+    pixel: u1[:, ::1]  # (N, 3)
+    texel: f8  # [m] side of a pixel of the largest
+
+
+class _Placed(NamedTuple):
+    """Where the parts stand."""
+
+    T_pc: f8[:, :, ::1]  # (P, 4, 4) camera to part
+    centre: f8[:, ::1]  # (P, 3) [m] in the camera's frame
+    R_lp: f8[:, :, ::1]  # (P, 3, 3) part to level frame
+
+
+class _Images(NamedTuple):
+    """The fields of `Drawn`."""
+
+    rgb: f4[:, :, ::1]
+    depth: f4[:, ::1]
+    cosine: f4[:, ::1]
+    owner: u1[:, ::1]
+
+
 class Crowd:
     """Figures that can be drawn into images of a room."""
 
@@ -31,9 +67,8 @@ class Crowd:
         """Paint all parts; `texel` is the side of the finest texture pixel [m]."""
         self._figures, self._camera, self._texel = figures, camera, texel
         parts = [(k, part) for k, figure in enumerate(figures) for part in figure.parts]
-        self._owner = np.array([k + 1 for k, _ in parts], dtype=np.int32)
-        self._kind = np.array([part.kind for _, part in parts], dtype=np.int32)
-        self._half = np.array([part.half for _, part in parts])
+        owner, kind = (np.array(values, dtype=np.int32) for values in zip(*((k + 1, part.kind) for k, part in parts), strict=True))
+        self._parts = _Parts(np.array([part.half for _, part in parts]), kind, owner)
         level, size, start, pixels = [0], [], [], []
         at = 0
         for number, (_, part) in enumerate(parts):
@@ -47,8 +82,8 @@ class Crowd:
                     break
                 image = cv2.resize(image, (image.shape[1] // 2, image.shape[0] // 2), interpolation=cv2.INTER_AREA)
             level.append(len(size))
-        self._level, self._size = np.array(level, dtype=np.int64), np.array(size, dtype=np.int64)
-        self._start, self._pixel = np.array(start, dtype=np.int64), np.concatenate(pixels)
+        level_at, sizes, starts = (np.array(values, dtype=np.int64) for values in (level, size, start))
+        self._pictures = _Pictures(level_at, sizes, starts, np.concatenate(pixels), texel)
 
     def draw(self, T_lc: np.ndarray, stamp: float, rgb: np.ndarray, depth: np.ndarray, cosine: np.ndarray) -> Drawn:
         """Draw what a camera at T_lc sees at `stamp` over the room's colour, depth and cosine of incidence."""
@@ -57,11 +92,10 @@ class Crowd:
         T_pc = se3.inverse(T_lp) @ T_lc
         centre = (se3.inverse(T_lc) @ T_lp)[:, :3, 3]
         rgb, depth, cosine = (np.array(image, dtype=np.float32) for image in (rgb, depth, cosine))
-        owner = np.zeros(depth.shape, dtype=np.uint8)
-        _draw(np.ascontiguousarray(T_pc), np.ascontiguousarray(centre), np.ascontiguousarray(T_lp[:, :3, :3]), self._half, self._kind,
-              self._owner, self._level, self._size, self._start, self._pixel, self._texel,
-              np.array([c.fx, c.fy, c.cx, c.cy]), SAMPLES, rgb, depth, cosine, owner)  # fmt: skip
-        return Drawn(rgb, depth, cosine, owner)
+        drawn = _Images(rgb, depth, cosine, np.zeros(depth.shape, dtype=np.uint8))
+        placed = _Placed(*(np.ascontiguousarray(of) for of in (T_pc, centre, T_lp[:, :3, :3])))
+        _draw(placed, self._parts, self._pictures, np.array([c.fx, c.fy, c.cx, c.cy]), SAMPLES, drawn)
+        return Drawn(*drawn)
 
 
 def _paint(part: Part, rng: np.random.Generator, texel: float) -> np.ndarray:
@@ -74,12 +108,12 @@ def _paint(part: Part, rng: np.random.Generator, texel: float) -> np.ndarray:
 
 
 @kernel
-def _draw(
-    T_pc: f8[:, :, ::1], centre: f8[:, ::1], R_lp: f8[:, :, ::1], half: f8[:, ::1], kind: i4[::1], part_owner: i4[::1], level: i8[::1],
-    size: i8[:, ::1], start: i8[::1], pixel: u1[:, ::1], texel: f8, pinhole: f8[::1], samples: f8[:, ::1], rgb: f4[:, :, ::1],
-    depth: f4[:, ::1], cosine: f4[:, ::1], owner: u1[:, ::1],
-):  # fmt: skip
+def _draw(placed: _Placed, parts: _Parts, pictures: _Pictures, pinhole: f8[::1], samples: f8[:, ::1], images: _Images):
     """Draw parts into the images, whose depth is the room's. Each pixel is sampled once for depth and four times for colour."""
+    T_pc, centre, R_lp = placed
+    half, kind, part_owner = parts
+    level, size, start, pixel, texel = pictures
+    rgb, depth, cosine, owner = images
     rows, columns = depth.shape
     n_samples = len(samples)
     fx, fy, cx, cy = pinhole
