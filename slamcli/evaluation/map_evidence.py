@@ -7,8 +7,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numba import f4, f8, i4, i8
+from numba import f8, i8
 
+from slamcli.depth import icp_kernels
 from slamcli.depth.icp import OrientedPoints
 from slamcli.geometry import se3
 from slamcli.jit.kernel import kernel
@@ -155,37 +156,23 @@ def compare(source: View, target: View) -> tuple[int, np.ndarray]:
     T_ts = se3.inverse(target.T_lc) @ source.T_lc
     fitted = np.zeros(2, dtype=np.int64)
     in_front = np.empty(len(source.surface) // SAMPLED + 1)
-    _compare(
-        np.ascontiguousarray(T_ts),
-        *_arrays(source.surface),
-        *_arrays(target.surface),
-        target.surface.row,
-        target.surface.pinhole,
-        in_front,
-        fitted,
-    )
+    _compare(np.ascontiguousarray(T_ts), source.surface.points, target.surface.points, target.surface.view, in_front, fitted)
     return int(fitted[0]), in_front[: fitted[1]]
-
-
-def _arrays(surface: OrientedPoints) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    return surface.xyz, surface.normal, surface.variance
 
 
 @kernel
 def _compare(
     T_ts: f8[:, ::1],
-    xyz: f4[:, ::1],
-    normal: f4[:, ::1],
-    variance: f4[::1],
-    met_xyz: f4[:, ::1],
-    met_normal: f4[:, ::1],
-    met_variance: f4[::1],
-    row_at: i4[:, ::1],
-    pinhole: f8[::1],
+    seen: icp_kernels.Points,
+    met_by: icp_kernels.Points,
+    view: icp_kernels.View,
     in_front: f8[::1],
     fitted: i8[::1],
 ) -> None:
     """Count in fitted[0] the sampled points that lie on the surface they meet; list how far the others are in front, fitted[1] of them."""
+    xyz, normal, variance = seen
+    met_xyz, met_normal, met_variance = met_by
+    row_at, pinhole = view
     height, width = row_at.shape
     for k in range(0, len(xyz), SAMPLED):
         p, n = xyz[k], normal[k]

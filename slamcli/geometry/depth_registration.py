@@ -3,6 +3,7 @@
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numba import f4, f8, i8
@@ -15,6 +16,19 @@ from slamcli.jit.kernel import kernel
 OVERLAP = 1.1  # by which the footprints of neighbouring readings overlap, so that a slanted surface shows no holes
 PATH_REACH = 0.1  # of a point's depth, by which the offset of the cameras may move it on a path that is a cubic
 SURFACE = 0.03  # relative difference up to which neighbouring readings are of one surface
+
+
+class ToColour(NamedTuple):
+    """Where readings lie among the pixels of the colour camera; ray, near and path as in `Registration`."""
+
+    ray: f4[:, :, ::1]  # (h, w, 3): x_c = depth * ray + t
+    t: f8[::1]  # (3,) [m]
+    intrinsics: f8[::1]  # (4,) fx, fy, cx, cy
+    lens: i8  # as in `bend`; 0 = none
+    k: f8[::1]  # (8,) as in `bend`
+    near: f8  # [m]
+    path: f4[:, :, :, ::1]  # (h, 2, 4, w)
+    half: f8[::1]  # (2,) half a footprint's width and height [px] at equal distances
 
 
 @dataclass(frozen=True)
@@ -65,8 +79,10 @@ class Registration:
         magnification = np.array([to.fx / self.depth_camera.fx, to.fy / self.depth_camera.fy]) * (0.5 * OVERLAP)
         lens = 2 if to.lens == EQUIDISTANT else 3 if to.is_rational else 1 if to.is_distorted else 0
         intrinsics = np.array([to.fx, to.fy, to.cx, to.cy])
-        to_colour = (self._ray, self.T_cd[:3, 3].copy(), intrinsics, lens, to.coefficients, self._near, self._path)
-        splat(np.ascontiguousarray(depth), *to_colour, magnification, out, away)
+        to_colour = ToColour(
+            self._ray, self.T_cd[:3, 3].copy(), intrinsics, lens, to.coefficients, self._near, self._path, half=magnification
+        )
+        splat(np.ascontiguousarray(depth), to_colour, out, away)
         return out
 
 
@@ -106,25 +122,12 @@ def bend(x, y, lens, k):
 
 
 @kernel(error_model="numpy")
-def splat(
-    depth: f4[:, ::1],
-    ray: f4[:, :, ::1],
-    t: f8[::1],
-    intrinsics: f8[::1],
-    lens: i8,
-    k: f8[::1],
-    near: f8,
-    path: f4[:, :, :, ::1],
-    half: f8[::1],
-    out: f4[:, ::1],
-    away: f4[:, ::1],
-):
+def splat(depth: f4[:, ::1], to: ToColour, out: f4[:, ::1], away: f4[:, ::1]):
     """Lay each reading of `depth` on `out` (H, W), filled with inf before; the nearest surface wins, and what is left uncovered becomes NaN.
 
-    ray (h, w, 3), t (3,): x_c = depth * ray + t. near, path : of `Registration`, for a lens.
-    half (2,): half a footprint's width and height [px] at equal distances. away (H, W), filled with inf before: [px^2] from each pixel to
-    the middle of the reading that it shows.
+    away (H, W), filled with inf before: [px^2] from each pixel to the middle of the reading that it shows.
     """
+    ray, t, intrinsics, lens, k, near, path, half = to
     fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
     rows, columns, width = out.shape[0], out.shape[1], depth.shape[1]
     us, vs, zs, sizes = np.empty(width), np.empty(width), np.empty(width), np.empty(width)

@@ -5,6 +5,7 @@ E. Rosten, T. Drummond, Machine learning for high-speed corner detection, ECCV 2
 
 import functools
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import f4, f8, i4, i8, int64, types, u1, u8, uint8, uintp
@@ -94,6 +95,17 @@ def corner_score(image: np.ndarray, box: np.ndarray, margin: int, score: np.ndar
     _score_inside(image.ravel(), np.uintp(image.shape[1]), box, np.uintp(margin), score.ravel())
 
 
+class _Peaks(NamedTuple):
+    """Peaks of the score, N of them at most, in cells."""
+
+    xy: i4[:, ::1]  # (N, 2) [px] on the canvas
+    strength: u1[::1]  # (N,)
+    cell_of: i4[::1]  # (N,)
+    best: u1[::1]  # (cells,) largest score of each
+    histogram: i4[:, ::1]  # (levels, 256) of the scores
+    first: i8[::1]  # (levels + 1,) row of each level's first
+
+
 @intrinsic
 def _trailing_zeros(_typing, word):
     """Count the bits below the lowest set one of a uint64, as one instruction."""
@@ -103,28 +115,14 @@ def _trailing_zeros(_typing, word):
 
 
 @kernel(error_model="numpy")
-def _peaks(
-    score: u1[:, ::1],
-    box: i8[:, ::1],
-    border: i8,
-    cell: i8,
-    threshold: u1,
-    row: u1[::1],
-    words: u8[::1],
-    xy: i4[:, ::1],
-    strength: u1[::1],
-    cell_of: i4[::1],
-    best: u1[::1],
-    histogram: i4[:, ::1],
-    first: i8[::1],
-):
+def _peaks(score: u1[:, ::1], box: i8[:, ::1], border: i8, cell: i8, threshold: u1, row: u1[::1], words: u8[::1], found: _Peaks):
     """List the peaks of each level in reading order: scores above the threshold, largest of their 3 x 3 neighbours, of equals the last.
 
     score : (H, W) uint8 canvas; border [px] : kept free at the sides of each level
     row : (W,) uint8, scratch, and words : the same bytes, eight pixels in one number: nearly all are 0
-    xy : (N, 2) int32 [px] on the canvas, strength : (N,) uint8, cell_of : (N,) int32; first : (levels + 1,) int64, row of each level's first
-    best : (cells,) uint8, largest score of each; histogram : (levels, 256) int32, of the scores of the peaks; both 0
+    found : to be written; its `best` and `histogram` are 0
     """
+    xy, strength, cell_of, best, histogram, first = found
     n, first_cell = 0, 0
     for level in range(len(box)):
         first[level] = n
@@ -157,26 +155,15 @@ def _peaks(
 
 
 @kernel
-def _keep(
-    threshold: i8,
-    weak: f8,
-    at_most: i8[::1],
-    first_cell: i8[::1],
-    histogram: i4[:, ::1],
-    xy: i4[:, ::1],
-    strength: u1[::1],
-    cell_of: i4[::1],
-    best: u1[::1],
-    first: i8[::1],
-    response: f4[::1],
-):
+def _keep(threshold: i8, weak: f8, at_most: i8[::1], first_cell: i8[::1], found: _Peaks, response: f4[::1]):
     """Choose peaks cell by cell: those above the threshold; where a cell has none, all of it, or only the best (of equals the first).
 
     at_most : (levels,) int64; where more than so many of a level pass, its threshold is the highest that as many exceed, and such a
     cell gives only its best; of these the strongest count, as many as are the share `weak` of `at_most`, or as the others leave open; 0 : no bound
     first_cell : (levels + 1,) int64, of each level
-    The chosen are moved to the front of xy, strength, response (N,) float32; `first` is made to fit. `best` is used up.
+    The chosen are moved to the front of `found` and of response (N,) float32; its `first` is made to fit, its `best` is used up.
     """
+    xy, strength, cell_of, best, histogram, first = found
     n, weaker = 0, np.zeros(256, dtype=np.int64)
     for level in range(len(at_most)):
         least, floor, is_bounded = threshold, 0, at_most[level] > 0
@@ -307,10 +294,10 @@ class Finder:
         first_cell = np.cumsum([0] + [-(-height // cell) * -(-width // cell) for height, width in self._inside], dtype=np.int64)
         best = np.zeros(first_cell[-1], dtype=np.uint8)
         histogram, first = np.zeros((len(self.box), 256), dtype=np.int32), np.empty(len(self.box) + 1, dtype=np.int64)
-        found = self._xy, self._strength, self._cell_of, best
+        found = _Peaks(self._xy, self._strength, self._cell_of, best, histogram, first)
         low = np.uint8(min(threshold, threshold_low))
-        _peaks(self._score, self.box, self.border, cell, low, self._row, self._row.view(np.uint64), *found, histogram, first)
-        _keep(threshold, weak, at_most, first_cell, histogram, *found, first, self._response)
+        _peaks(self._score, self.box, self.border, cell, low, self._row, self._row.view(np.uint64), found)
+        _keep(threshold, weak, at_most, first_cell, found, self._response)
         xy, response = self._xy[: first[-1]], self._response[: first[-1]]
         if rank_by == "sum":
             _response(image, xy, response)
