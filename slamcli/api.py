@@ -86,6 +86,7 @@ def run(
         said = [finding.name for findings in found.values() for finding in findings]
         if resolved.recording.find_depth_camera and len(targets) == 1 and "registration" in said:
             ((root, findings),) = found.items()
+            tell("depth does not lie on colour: looking for its camera takes some 20 s")
             opened, dataset, resolved, found[root] = _registered(opened, dataset, resolved, findings, reopen)
     which: dict[str, Any] = {"start": start, "until": until, "force": force}
     _bring_up_to_date(opened, resolved, dataset, looked=found, progress=progress, tell=tell, **which)
