@@ -135,8 +135,8 @@ def _unit_sigma(problem: Problem, lm: np.ndarray) -> float:
 
     lm : (O,) landmark of each observation, in the order given
     """
-    chi2 = problem.in_given_order(problem.chi2(problem.start))
-    is_used = problem.in_given_order(problem.is_inlier(problem.chi2(problem.start)))
+    chi2 = problem.chi2(problem.start)
+    chi2, is_used = problem.in_given_order(chi2), problem.in_given_order(problem.is_inlier(chi2))
     has_depth = problem.in_given_order(problem.measured[:, INV_SIGMA_Z] > 0.0)
     n_residuals = 2 * int(is_used.sum()) + int((is_used & has_depth).sum())
     n_unknowns = problem.hold.size * POSE + len(np.unique(lm[is_used])) * POINT

@@ -23,9 +23,8 @@ from slamcli.inspection.registration import Colours, Edges
 
 # All numbers of a depth camera: logarithm of the focal length, principal point [px], rotation vector [rad] and translation [m] of T_cd.
 FOCAL, CENTRE, TURN, OFFSET = 0, slice(1, 3), slice(3, 6), slice(6, 9)
-CLIMBED = np.array(
-    [0, 3, 4, 5, 6, 7]
-)  # those that are climbed to: a principal point looks like a turn from afar, an offset ahead like nothing
+# Those that are climbed to: a principal point looks like a turn from afar, an offset ahead like nothing.
+CLIMBED = np.array([0, 3, 4, 5, 6, 7])
 
 BLUR = (8.0, 4.0, 2.0)  # [px] of the pictures' steepness, from round to round: what is far off is found first
 LAGS = (-0.02, -0.01, 0.0, 0.01, 0.02, 0.03)  # [s] by which depth stamps may be late
