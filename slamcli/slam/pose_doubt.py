@@ -77,7 +77,7 @@ def _drift(tracks: Tracks, map_: Map, is_blind: np.ndarray) -> np.ndarray:
     step[is_blind] = STEP_BLIND
     frames = np.arange(n - 1)
     variance = np.maximum(step[1:], step[:-1]) ** 2
-    ties, (edges, edge_variance) = _ties(map_), _edges(map_, is_blind)
+    ties, (edges, edge_variance) = _ties(map_, is_blind), _edges(map_, is_blind)
     row, column = np.concatenate([frames, ties[:, 0], edges[:, 0]]), np.concatenate([frames + 1, ties[:, 1], edges[:, 1]])
     value = np.concatenate([variance, np.full(len(ties), TIE_SIGMA**2), edge_variance])
     order = np.argsort(-value, kind="stable")  # of several ways between two frames, the last one written is the best
@@ -89,14 +89,23 @@ def _drift(tracks: Tracks, map_: Map, is_blind: np.ndarray) -> np.ndarray:
     return np.sqrt(away)
 
 
-def _ties(map_: Map) -> np.ndarray:
-    """List pairs (N, 2) of frames, both key frames, that at least TIED landmarks were seen first and last in."""
-    if len(map_.obs_lm) == 0:
+def _ties(map_: Map, is_blind: np.ndarray) -> np.ndarray:
+    """List pairs (N, 2) of frames, both key frames that are not blind, that share at least TIED landmarks: first and last, or one after the other.
+
+    What happened between two such frames does not tear them apart, so the blind ones are passed over.
+    """
+    sees = ~is_blind[map_.kf_frame[map_.obs_kf]]
+    landmark, kf = map_.obs_lm[sees], map_.obs_kf[sees]
+    if len(landmark) == 0:
         return np.zeros((0, 2), dtype=np.int64)
-    starts = np.flatnonzero(np.diff(map_.obs_lm, prepend=-1))
-    ends = np.append(starts[1:], len(map_.obs_lm)) - 1
-    pairs, n_shared = np.unique(np.stack([map_.obs_kf[starts], map_.obs_kf[ends]], axis=1), axis=0, return_counts=True)
-    return map_.kf_frame[pairs[(n_shared >= TIED) & (pairs[:, 0] != pairs[:, 1])]].astype(np.int64)
+    goes_on = landmark[1:] == landmark[:-1]
+    starts, ends = np.flatnonzero(np.append(True, ~goes_on)), np.flatnonzero(np.append(~goes_on, True))
+    listed = [np.stack([kf[:-1][goes_on], kf[1:][goes_on]], axis=1), np.stack([kf[starts], kf[ends]], axis=1)]
+    tied = []
+    for each in listed:
+        pairs, n_shared = np.unique(each, axis=0, return_counts=True)
+        tied.append(pairs[(n_shared >= TIED) & (pairs[:, 0] != pairs[:, 1])])
+    return map_.kf_frame[np.concatenate(tied)].astype(np.int64)
 
 
 def _edges(map_: Map, is_blind: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

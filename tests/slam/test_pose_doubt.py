@@ -147,9 +147,29 @@ def test_surface_that_is_looked_through_is_told_of_where_it_is_more_than_right_p
     assert ("look through 3%" in pose_doubt.findings(record)[0].text) == is_told
 
 
+SIGHTED = np.zeros(FRAMES, dtype=bool)  # frames that are blind: none
+
+
 @pytest.mark.parametrize(("n", "is_tied"), [(29, False), (30, True)])
 def test_thirty_landmarks_seen_first_and_last_tie_two_key_frames(n: int, is_tied: bool) -> None:
     _, map_ = found(room()[1], ties=((3, 9), (20, 20)))
     rows = np.flatnonzero((map_.obs_lm < n) | (map_.obs_lm >= 50))
     map_ = replace(map_, obs_lm=np.unique(map_.obs_lm[rows], return_inverse=True)[1], obs_kf=map_.obs_kf[rows])
-    assert pose_doubt._ties(map_).tolist() == ([[3, 9]] if is_tied else [])
+    assert pose_doubt._ties(map_, SIGHTED).tolist() == ([[3, 9]] * 2 if is_tied else [])
+
+
+def seen_in(*key_frames: int) -> Map:
+    """A map whose landmarks are each seen in all of these key frames."""
+    _, map_ = found(room()[1], ties=((key_frames[0], key_frames[-1]),))
+    n = int(map_.obs_lm.max()) + 1
+    return replace(map_, obs_lm=np.repeat(np.arange(n), len(key_frames)), obs_kf=np.tile(key_frames, n))
+
+
+def test_landmarks_tie_each_key_frame_to_the_next_that_sees_them() -> None:
+    assert sorted(pose_doubt._ties(seen_in(3, 6, 9), SIGHTED).tolist()) == [[3, 6], [3, 9], [6, 9]]
+
+
+def test_landmarks_tie_key_frames_past_one_that_shows_no_static_world_and_not_to_it() -> None:
+    is_blind = np.arange(FRAMES) == 9
+    assert np.unique(pose_doubt._ties(seen_in(3, 6, 9, 12), is_blind), axis=0).tolist() == [[3, 6], [3, 12], [6, 12]]
+    assert len(pose_doubt._ties(seen_in(3, 9), is_blind)) == 0
