@@ -18,4 +18,4 @@ def _run(target: str, options: dict[str, Any]) -> str:
     from slamcli import console
 
     console.set_up(0)
-    return str(slamcli.run(target, progress=console.progress, tell=console.say, **options).path)
+    return str(slamcli.run(target, **{"progress": console.progress, "tell": console.say, **options}).path)

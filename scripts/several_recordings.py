@@ -1,6 +1,6 @@
 """Measure several recordings of one house in one map: one frame, the order, the cost of adding one, and joins that are wrong.
 
-    python scripts/several_recordings.py FOLDER [--frames 240] [--width 640] [--pairs 20] [--pair-width 160]
+    python scripts/several_recordings.py FOLDER [--frames 240] [--width 640] [--seed 1] [--pairs 20] [--pair-width 160] [--first-pair 100]
 
 Renders into FOLDER what is not there yet: four recordings of one room (other starts, directions and light, the same stamps, each
 seeing a part of what the next sees), and pairs of look-alike places, every second pair two corridors whose doors are all equal. Prints
@@ -13,6 +13,7 @@ seeing a part of what the next sees), and pairs of look-alike places, every seco
 import argparse
 import os
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -42,17 +43,20 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--frames", type=int, default=240, help="of each recording of the house")
     parser.add_argument("--width", type=int, default=640)
+    parser.add_argument("--seed", type=int, default=1, help="of the house")
     parser.add_argument("--pairs", type=int, default=20)
     parser.add_argument("--pair-width", type=int, default=160)
+    parser.add_argument("--first-pair", type=int, default=100, help="seed of the first pair; the others follow on it")
     given = parser.parse_args()
     given.folder.mkdir(parents=True, exist_ok=True)
     os.chdir(given.folder)
     takes = {
-        name: rendered(Path("house") / name, given.width, frames=given.frames, seed=1, laps=0.55, **how) for name, how in TAKES.items()
+        name: rendered(Path("house") / name, given.width, frames=given.frames, seed=given.seed, laps=0.55, **how)
+        for name, how in TAKES.items()
     }
     one_house(takes)
     adding(takes)
-    look_alikes(given.pairs, given.pair_width)
+    look_alikes(range(given.first_pair, given.first_pair + given.pairs), given.pair_width)
 
 
 def rendered(folder: Path, width: int, **settings: Any) -> Path:
@@ -89,10 +93,10 @@ def adding(takes: dict[str, Path]) -> None:
     print(f"  APE {1000 * error(grown).rmse:.2f} mm, of a run of all four {1000 * error(four).rmse:.2f} mm")
 
 
-def look_alikes(n_pairs: int, width: int) -> None:
-    """Print of how many pairs of look-alike places the two were joined."""
+def look_alikes(pairs: Sequence[int], width: int) -> None:
+    """Print of how many pairs of look-alike places, each of a seed, the two were joined."""
     joined, reasons = [], Counter[str]()
-    for pair in range(n_pairs):
+    for pair in pairs:
         places = [rendered(Path("pairs") / f"{pair}-{twin}", width, frames=120, laps=1.05, **of_a_pair(pair, twin)) for twin in (0, 1)]
         run = api.run(places, path=f"runs/pair{pair}", until="loop").directory
         offset, map_ = int(run.load(Recordings, "extract").recording_offset[1]), run.load(Map, "loop")
@@ -104,7 +108,7 @@ def look_alikes(n_pairs: int, width: int) -> None:
             i, j, *_, reason = row.split(",", 6)
             if (frame[int(i)] < offset) != (frame[int(j)] < offset) and "matches" not in reason and "motion" not in reason:
                 reasons["".join(c for c in reason if not c.isdigit())] += 1
-    print(f"look-alike places: {len(joined)} of {n_pairs} pairs joined {joined or ''}")
+    print(f"look-alike places: {len(joined)} of {len(pairs)} pairs joined {joined or ''}")
     for reason, n in reasons.most_common(6):
         print(f"  {n} closures between them: {reason or 'accepted'}")
 
@@ -112,8 +116,8 @@ def look_alikes(n_pairs: int, width: int) -> None:
 def of_a_pair(pair: int, twin: int) -> dict[str, Any]:
     """Choose one of two look-alike places: a room of the same patterns and pieces in another order, or another corridor of equal doors."""
     if pair % 2:
-        return {"alias": "corridor", "seed": 100 + pair + 500 * twin}
-    return {"seed": 100 + pair, "twin": twin, "take": twin}
+        return {"alias": "corridor", "seed": pair + 500 * twin}
+    return {"seed": pair, "twin": twin, "take": twin}
 
 
 def error(run: RunDir) -> trajectory_error.Ape:

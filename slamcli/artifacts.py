@@ -1,16 +1,17 @@
 """Records of arrays as folders of `.npy`, one file a field. A record's type is its schema; it is checked at every save and load."""
 
 import io
-import mmap
 from collections.abc import Sequence
-from dataclasses import fields
+from contextlib import ExitStack
+from dataclasses import Field, fields
 from pathlib import Path
 from tokenize import TokenError
-from typing import Any, TypeVar
+from types import TracebackType
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 
-from slamcli import files
+from slamcli import files, mapped_memory
 from slamcli.errors import SlamError
 
 Record = TypeVar("Record")
@@ -43,23 +44,120 @@ def save(value: Any, folder: Path) -> None:
     """Write each field as ``<folder>/<field>.npy``. Several types may share a folder: their field names differ."""
     check(value)
     for spec in fields(value):
-        path = Path(folder) / f"{spec.name}.npy"
-        if path.exists():
-            raise ValueError(f"{type(value).__name__}.{spec.name}: {path} is already written by another type")
-        column = _narrowest(np.asarray(getattr(value, spec.name), order="C"), spec.metadata["narrow"])
-        header = io.BytesIO()
-        np.lib.format.write_array_header_1_0(header, np.lib.format.header_data_from_array_1_0(column))
-        data = column.reshape(-1).view(np.uint8).data  # numpy's own way hides why a write fails
-        files.write_new(path, memoryview(header.getvalue()), data)
+        _save_field(type(value), spec, getattr(value, spec.name), folder)
 
 
-def _narrowest(column: np.ndarray, narrow: Sequence[np.dtype]) -> np.ndarray:
-    """Return a column in the first of these whole-number types that holds all its values, as it is where none does."""
-    least, most = int(column.min(initial=0)) if narrow else 0, int(column.max(initial=0)) if narrow else 0
-    for dtype in narrow:
-        if np.iinfo(dtype).min <= least and most <= np.iinfo(dtype).max:
-            return column.astype(dtype)
-    return column
+def _save_field(cls: type, spec: Field, value: Any, folder: Path) -> None:
+    column = np.asarray(value, order="C")
+    if narrow := spec.metadata["narrow"]:
+        column = column.astype(_narrowest(int(column.min(initial=0)), int(column.max(initial=0)), (*narrow, column.dtype)), copy=False)
+    data = column.reshape(-1).view(np.uint8).data  # numpy's own way hides why a write fails
+    files.write_new(_new_path(cls, spec, folder), memoryview(_header(column.shape, column.dtype)), data)
+
+
+def _new_path(cls: type, spec: Field, folder: Path) -> Path:
+    path = Path(folder) / f"{spec.name}.npy"
+    if path.exists():
+        raise ValueError(f"{cls.__name__}.{spec.name}: {path} is already written by another type")
+    return path
+
+
+def _header(shape: tuple[int, ...], dtype: np.dtype) -> bytes:
+    """Return what precedes an array's bytes in its file; the number of rows does not change its length."""
+    header = io.BytesIO()
+    told = {"shape": shape, "fortran_order": False, "descr": np.lib.format.dtype_to_descr(dtype)}
+    np.lib.format.write_array_header_1_0(header, told)
+    return header.getvalue()
+
+
+def _narrowest(least: int, most: int, dtypes: Sequence[np.dtype]) -> np.dtype:
+    """Return the first of these whole-number types that holds what lies between two values; the last holds everything."""
+    return next(dtype for dtype in dtypes if np.iinfo(dtype).min <= least and most <= np.iinfo(dtype).max)
+
+
+class Writer(Generic[Record]):
+    """Write a record of which some fields come a few rows at a time: the files are those that `save` would have written of the whole.
+
+    with Writer(Matches, folder, "row") as writer:
+        writer.append(row=rows)
+        matches = writer.finish(pair=pair, offset=offset)
+    """
+
+    def __init__(self, cls: type[Record], folder: Path, *growing: str) -> None:
+        """Begin the files of the fields `growing`, without rows."""
+        self._cls, self._folder = cls, folder
+        self._open = ExitStack()
+        self._specs = {spec.name: spec for spec in fields(cls)}  # type: ignore[arg-type]
+        self._growing = {name: _Growing(_new_path(cls, self._specs[name], folder), self._specs[name]) for name in growing}
+        for column in self._growing.values():
+            self._open.callback(column.close)
+
+    def __enter__(self) -> "Writer[Record]":
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self._open.close()
+
+    def append(self, **rows: np.ndarray) -> None:
+        """Add rows (N, ...) to fields, each in the dtype declared."""
+        for name, values in rows.items():
+            self._growing[name].append(values)
+
+    def finish(self, **values: Any) -> Record:
+        """Write the other fields and return the record, mapped and to be read alone; SlamError, or ValueError, as `save` and `load`."""
+        for name, value in values.items():
+            _save_field(self._cls, self._specs[name], value, self._folder)
+        for column in self._growing.values():
+            column.finish()
+        record = load(self._cls, self._folder)
+        for name in self._specs:
+            mapped_memory.adopt(getattr(record, name))
+        return record
+
+
+class _Growing:
+    """The file of one field whose rows come a few at a time."""
+
+    def __init__(self, path: Path, spec: Field) -> None:
+        self._path, self._declared, self._narrow = path, spec.metadata["dtype"], spec.metadata["narrow"]
+        self._tail = tuple(int(symbol) for symbol in spec.metadata["shape"][1:])
+        self._n = self._least = self._most = 0
+        self._dtype: np.dtype = (*self._narrow, self._declared)[0]
+        with files.written(path):
+            self._file = open(path, "x+b", buffering=files.AT_ONCE)  # noqa: SIM115 - closed by the writer that it belongs to
+            self._file.write(_header((0, *self._tail), self._dtype))
+
+    def append(self, rows: np.ndarray) -> None:
+        if rows.dtype != self._declared or rows.shape[1:] != self._tail:
+            raise ValueError(f"{self._path.name}: rows {rows.dtype} {rows.shape} are not {self._declared} (N, {self._tail})")
+        if self._narrow:
+            self._least, self._most = min(self._least, int(rows.min(initial=0))), max(self._most, int(rows.max(initial=0)))
+            self._become(_narrowest(self._least, self._most, (*self._narrow, self._declared)))
+        with files.written(self._path):
+            self._file.write(np.ascontiguousarray(rows, dtype=self._dtype).reshape(-1).view(np.uint8).data)
+        self._n += len(rows)
+
+    def finish(self) -> None:
+        with files.written(self._path):
+            self._file.seek(0)
+            self._file.write(_header((self._n, *self._tail), self._dtype))
+            self._file.close()
+
+    def close(self) -> None:
+        self._file.close()
+
+    def _become(self, dtype: np.dtype) -> None:
+        """Write anew, in another type, what is there."""
+        if dtype == self._dtype:
+            return
+        with files.written(self._path):
+            self._file.flush()
+            before = np.fromfile(self._path, dtype=self._dtype, offset=len(_header((0, *self._tail), self._dtype)))
+            self._file.seek(0)
+            self._file.truncate()
+            self._file.write(_header((0, *self._tail), dtype))
+            self._file.write(before.astype(dtype).view(np.uint8).data)
+        self._dtype = dtype
 
 
 def file_names(cls: type) -> list[str]:
@@ -99,21 +197,3 @@ def _read(path: Path) -> np.ndarray:
         raise ValueError(f"{path.name}: {error}") from error
     except OSError as error:
         raise SlamError(f"{path}: cannot be read ({files.told(error)})") from error
-
-
-def release(value: Any) -> None:
-    """Let go of the memory that the mapped fields of a record hold so far; what is read again comes from the file.
-
-    For fields that are read alone: what was written to one would be forgotten. Other threads may read them meanwhile.
-    """
-    for spec in fields(value):
-        if (mapped := _map_of(getattr(value, spec.name))) is not None:
-            mapped.madvise(mmap.MADV_DONTNEED)
-
-
-def _map_of(column: np.ndarray) -> mmap.mmap | None:
-    """Return the map that an array is a view of, None where it is of no file or where the system takes no advice."""
-    base: Any = column
-    while isinstance(base, np.ndarray):
-        base = base.base
-    return base if isinstance(base, mmap.mmap) and hasattr(mmap, "MADV_DONTNEED") else None

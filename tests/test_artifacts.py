@@ -3,7 +3,6 @@
 import dataclasses
 import io
 import pickle
-import resource
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -172,22 +171,53 @@ def test_every_core_type_declares_dtype_shape_and_meaning_of_each_field() -> Non
             assert spec.metadata["meaning"], f"{kind.__name__}.{spec.name}"
 
 
-@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="the system does not tell")
-def test_what_is_released_takes_no_memory_until_it_is_read_again(tmp_path: Path) -> None:
-    def mapped() -> int:
-        return int(Path("/proc/self/statm").read_text().split()[2]) * resource.getpagesize()
-
-    rows = 1 << 21
-    artifacts.save(ragged(2, rows), tmp_path)
-    back, before = artifacts.load(Ragged, tmp_path), mapped()
-    total, size = float(back.xy.sum(dtype="f8")), back.xy.nbytes
-    assert mapped() - before > 0.9 * size
-    artifacts.release(back)
-    assert mapped() - before < 0.1 * size
-    assert float(back.xy.sum(dtype="f8")) == total
+def written_by_parts(folder: Path, value: Ragged, parts: int) -> Ragged:
+    with artifacts.Writer(Ragged, folder, "xy", "depth") as writer:
+        for xy, depth in zip(np.array_split(value.xy, parts), np.array_split(value.depth, parts), strict=True):
+            writer.append(xy=xy, depth=depth)
+        return writer.finish(offset=value.offset, total=value.total, is_found=value.is_found)
 
 
-def test_what_is_in_no_file_is_kept() -> None:
+@given(rows=st.integers(0, 12), parts=st.integers(1, 5))
+def test_rows_that_come_a_few_at_a_time_give_the_files_of_the_whole(
+    tmp_path_factory: pytest.TempPathFactory, rows: int, parts: int
+) -> None:
+    whole, by_parts = tmp_path_factory.mktemp("whole"), tmp_path_factory.mktemp("parts")
+    value = ragged(2, rows)
+    artifacts.save(value, whole)
+    back = written_by_parts(by_parts, value, parts)
+    np.testing.assert_array_equal(back.xy, value.xy)
+    assert {path.name: path.read_bytes() for path in by_parts.iterdir()} == {path.name: path.read_bytes() for path in whole.iterdir()}
+
+
+@given(parts=st.lists(st.lists(st.sampled_from([-(2**31), -129, -128, -1, 0, 1, 127, 128, 65535, 65536]), max_size=3), max_size=5))
+def test_whole_numbers_that_come_a_few_at_a_time_are_in_the_type_that_holds_them_all(
+    tmp_path_factory: pytest.TempPathFactory, parts: list[list[int]]
+) -> None:
+    whole, by_parts = tmp_path_factory.mktemp("whole"), tmp_path_factory.mktemp("parts")
+    artifacts.save(Narrowed(np.array([n for part in parts for n in part], np.int32)), whole)
+    with artifacts.Writer(Narrowed, by_parts, "row") as writer:
+        for part in parts:
+            writer.append(row=np.array(part, np.int32))
+        writer.finish()
+    assert (by_parts / "row.npy").read_bytes() == (whole / "row.npy").read_bytes()
+
+
+@pytest.mark.parametrize("rows", [np.zeros((3, 2), "f8"), np.zeros((3, 3), "f4"), np.zeros(3, "f4")])
+def test_rows_that_do_not_fit_the_declaration_are_not_written(tmp_path: Path, rows: np.ndarray) -> None:
+    with artifacts.Writer(Ragged, tmp_path, "xy", "depth") as writer, pytest.raises(ValueError, match="xy"):
+        writer.append(xy=rows)
+
+
+def test_fields_of_unequal_length_are_refused_in_the_end(tmp_path: Path) -> None:
     value = ragged()
-    artifacts.release(dataclasses.replace(value, xy=value.xy[1:]))
-    np.testing.assert_array_equal(value.xy, ragged().xy)
+    with artifacts.Writer(Ragged, tmp_path, "xy", "depth") as writer:
+        writer.append(xy=value.xy[:4], depth=value.depth)
+        with pytest.raises(SlamError, match=r"Ragged.depth: shape \(5,\)"):
+            writer.finish(offset=value.offset, total=value.total, is_found=value.is_found)
+
+
+def test_a_writer_takes_no_file_of_another_type(tmp_path: Path) -> None:
+    artifacts.save(ragged(), tmp_path)
+    with pytest.raises(ValueError, match="xy.npy is already written"):
+        artifacts.Writer(Ragged, tmp_path, "xy")

@@ -12,6 +12,8 @@ from pathlib import Path
 import pytest
 from click.testing import Result
 
+import slamcli
+from slamcli import mapped_memory
 from slamcli.runs.run_directory import RunDir
 from slamcli.stages import NAMES
 
@@ -56,6 +58,17 @@ def test_another_process_with_other_threads_and_hash_seed_gives_the_same_bytes(r
     _, said = process.communicate(timeout=300)
     assert process.returncode == 0, said
     assert digests(tmp_path / "again") == digests(room_run)
+
+
+def test_memory_that_is_let_go_all_the_time_gives_the_same_bytes(
+    room: Path, room_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No stage writes to what it was given, and none relies on where its large arrays lie."""
+    monkeypatch.setattr(mapped_memory, "MOST_RESIDENT", 0)
+    monkeypatch.setattr(mapped_memory, "LEAST_FILE", 1)
+    monkeypatch.setattr(mapped_memory, "LOOK", 0.001)
+    again = slamcli.run(room, path=tmp_path / "again")
+    assert digests(again.path) == digests(room_run)
 
 
 @pytest.mark.parametrize("stage", NAMES)

@@ -20,6 +20,7 @@ LAYERS = (
     ("errors", "data"),
     ("__init__", "user_cache"),
     ("files", "interruption", "address_space"),
+    ("mapped_memory",),
     ("schema", "artifacts", "parallel", "console", "open3d_loader"),
     ("jit",),
     ("geometry",),

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numba import b1, f4, f8, i8
 
+from slamcli import mapped_memory
 from slamcli.geometry import se3
 from slamcli.geometry.algebra import product, solve
 from slamcli.geometry.camera import Camera
@@ -90,7 +91,7 @@ def rectify(features: Features, timing: Timing, camera: Camera) -> Features:
     slanted surface that is another point. The reading has changed by t times what the point's depth does less what the slant makes of
     the point's way through the image.
     """
-    xy, depth = np.array(features.xy), np.array(features.depth)
+    xy, depth = mapped_memory.copy(features.xy), mapped_memory.copy(features.depth)
     _rectify(
         np.array(features.offset, dtype=np.int64),
         np.ascontiguousarray(timing.twist, dtype=np.float64),

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from slamcli import mapped_memory
 from slamcli.calibration import rolling_shutter
 from slamcli.calibration.measurement_derivatives import TIMES, Predictions, current_value, derivative
 from slamcli.config.options import OptimizeConfig, SensorConfig
@@ -63,12 +64,14 @@ def recalibrate(features: Features, given: Camera, camera: Camera) -> Features:
     """Return features, measured under the calibration `given`, as they are under another one of the same camera."""
     if camera == given:
         return features
-    xy = np.empty_like(features.xy)
+    xy, depth, slope = (mapped_memory.empty(column.shape, column.dtype) for column in (features.xy, features.depth, features.slope))
+    growth = np.float32(camera.depth_scale / given.depth_scale)
     for start in range(0, len(xy), ROWS_AT_ONCE):
         part = slice(start, start + ROWS_AT_ONCE)
         xy[part] = camera.undistort(given.distort(features.xy[part]))
-    slope = features.slope * np.float32(camera.depth_scale / given.depth_scale)
-    return replace(features, xy=xy, depth=camera.reread(features.depth, given), slope=slope)
+        depth[part] = camera.reread(features.depth[part], given)
+        slope[part] = features.slope[part] * growth
+    return replace(features, xy=xy, depth=depth, slope=slope)
 
 
 def estimate_sensing(

@@ -15,37 +15,18 @@ Change = Callable[[int, np.ndarray], np.ndarray]
 
 def encode(images: Iterable[np.ndarray | None], shape: tuple[int, int]) -> CoarseDepth:
     """Encode the coarse depth images (V, U) uint16 of a recording's frames, None where a frame has none."""
-    codes = Codes(shape)
-    for image in images:
-        codes.add(None if image is None else code_of(image))
-    return codes.table()
+    nothing = code_of(np.zeros(shape, np.uint16))
+    codes = [nothing if image is None else code_of(image) for image in images]
+    return CoarseDepth(
+        coarse_shape=np.array(shape, dtype=np.int32),
+        coarse_offset=np.cumsum([0, *map(len, codes)], dtype=np.int64),
+        coarse_code=np.frombuffer(b"".join(codes), dtype=np.uint8),
+    )
 
 
 def code_of(image: np.ndarray) -> bytes:
     """Encode one coarse depth image (V, U) uint16."""
     return rvl.encode(image) if image.size else b""
-
-
-class Codes:
-    """The codes of a recording's coarse depth images, joined as they come: of a long one they fill much memory, and twice that at the end."""
-
-    def __init__(self, shape: tuple[int, int]) -> None:
-        """Start without any; `shape` is that of the images, rows and columns."""
-        self._shape, self._nothing = shape, code_of(np.zeros(shape, np.uint16))
-        self._joined, self._offset = bytearray(), [0]
-
-    def add(self, code: bytes | None) -> None:
-        """Add the code of the next frame's image, None where it has none."""
-        self._joined += self._nothing if code is None else code
-        self._offset.append(len(self._joined))
-
-    def table(self) -> CoarseDepth:
-        """Return them all; nothing can be added afterwards."""
-        return CoarseDepth(
-            coarse_shape=np.array(self._shape, dtype=np.int32),
-            coarse_offset=np.array(self._offset, dtype=np.int64),
-            coarse_code=np.frombuffer(self._joined, dtype=np.uint8),
-        )
 
 
 class CoarseImages:

@@ -7,7 +7,7 @@ import math
 import platform
 import zlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from types import MappingProxyType
@@ -73,11 +73,14 @@ class Inputs:
         return self._dataset()
 
     def load(self, cls: type[Record], stage: str) -> Record:
-        """Read a record of arrays that `stage` wrote."""
-        from slamcli import artifacts
+        """Read a record of arrays that `stage` wrote; nothing may be written to them."""
+        from slamcli import artifacts, mapped_memory
 
         names = artifacts.file_names(cls)
-        return artifacts.load(cls, self._run.intact(self._declared(stage), *names))
+        record = artifacts.load(cls, self._run.intact(self._declared(stage), *names))
+        for name in (spec.name for spec in fields(record)):  # type: ignore[arg-type]
+            mapped_memory.adopt(getattr(record, name))
+        return record
 
     def camera(self, stage: str = "extract") -> "Camera":
         """Return the intrinsics that extract used, or those known after optimize or loop."""
@@ -244,7 +247,9 @@ class Pipeline:
         compilation.ensure(progress=self._progress, tell=self._tell)
         with self.run.writing(stage.name) as out:
             try:
-                with Meter() as meter, one_thread_in_blas():
+                from slamcli import mapped_memory
+
+                with Meter() as meter, one_thread_in_blas(), mapped_memory.bounded(out):
                     module = importlib.import_module(f"slamcli.stages.{stage.name}")
                     meter.watch_compiler(self._tell)
                     run = module.run if begun is None else begun.go_on

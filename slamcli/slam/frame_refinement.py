@@ -18,7 +18,6 @@ from slamcli.sparse_map.sparse_map import SparseMap
 
 NEIGHBOURS = 20  # covisible key frames whose landmarks are looked for
 AT_ONCE = 64  # frames of one key frame that a thread refines, so that the others find work, too
-KEPT = 1000  # frames whose features stay in memory, some 60 kB each
 LOST_WIDENING = 8.0  # a lost frame's neighbour stands where a frame's fast turn leaves it, some tens of pixels off
 
 
@@ -63,12 +62,10 @@ class _FrameRefinement:
         of_each = np.split(chosen, np.flatnonzero(np.diff(self._ref_kf[chosen])) + 1)
         groups = [group[k : k + AT_ONCE] for group in of_each for k in range(0, len(group), AT_ONCE)]
         refined = ordered_map(self._refine_group, groups, workers=workers)
-        for number, (i, estimate) in enumerate(progress(chain.from_iterable(refined), "final refinement", len(chosen)), start=1):
+        for i, estimate in progress(chain.from_iterable(refined), "final refinement", len(chosen)):
             if estimate is not None:
                 self._record(i, int(self._ref_kf[i]), estimate)
                 self._is_measured[i] = True
-            if number % KEPT == 0:
-                self._frames.release()
 
     def find_lost(self) -> None:
         """Look for each lost frame where its neighbour in time stands, first the one before it, then the one after."""

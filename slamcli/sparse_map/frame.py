@@ -4,7 +4,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slamcli import artifacts
 from slamcli.config.options import SensorConfig
 from slamcli.geometry.camera import Camera
 from slamcli.schema import Features
@@ -43,7 +42,3 @@ class FrameStore:
             bucket_start=bucket_start,
             bucket_rows=bucket_rows,
         )
-
-    def release(self) -> None:
-        """Let go of the features that were read so far: they stay in their files, and a long recording's would fill the memory."""
-        artifacts.release(self.features)

@@ -19,7 +19,7 @@ class Stored(Protocol):
     """The folders of stages: of a run, or those that a stage may read."""
 
     def load(self, cls: type[Record], stage: str) -> Record:
-        """Read a record of arrays that `stage` wrote."""
+        """Read a record of arrays that `stage` wrote, to be read alone: their memory may be let go, and what was written with it."""
 
     def camera(self, stage: str = "extract") -> Camera:
         """Read the intrinsics that extract used, or those known after optimize or loop."""

@@ -4,6 +4,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from types import TracebackType
 
 import numpy as np
 
@@ -16,7 +17,7 @@ from slamcli.depth.coarse_images import CoarseImages
 from slamcli.errors import BadFrame, SlamError
 from slamcli.geometry.camera import Camera
 from slamcli.parallel import ordered_map
-from slamcli.schema import Features, Flow
+from slamcli.schema import CoarseDepth, Features, Flow
 from slamcli.slam import doubt, stream_doubt
 from slamcli.slam.doubt import Finding
 from slamcli.slam.stream_doubt import Readings
@@ -56,14 +57,14 @@ def frames(dataset: Dataset, settings: ExtractConfig, rows: Sequence[int], *, wo
 def assemble(found: Iterable[Frame], inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
     """Write what was found in each frame of the recording, in order."""
     dataset, camera = inputs.dataset, inputs.dataset.camera
-    gathered = _Gathered(len(dataset), camera, cfg.extract)
-    for frame in found:
-        gathered.add(frame)
+    with _Gathered(out, camera, cfg.extract) as gathered:
+        for frame in found:
+            gathered.add(frame)
+        features, coarse = gathered.finish(dataset)
     n = np.diff(gathered.offset)
     for i, faults in enumerate(gathered.faults):
         for fault in faults:
             tools.warn(f"frame {i} skipped: {fault}" if n[i] == 0 else f"frame {i} has no depth: {fault}")
-    features, coarse = gathered.features(dataset), gathered.codes.table()
     if not n.any():
         blank = (
             f"{dataset.root}: no feature in any of the {len(dataset)} colour frames: are they blank? try: slamcli inspect {dataset.root}"
@@ -72,8 +73,6 @@ def assemble(found: Iterable[Frame], inputs: Inputs, out: Path, cfg: Config, too
         if not any(images[i].any() for i in range(len(images))):
             raise SlamError(blank)
         tools.warn(f"{blank}; the camera can be tracked by the shape alone that depth shows")
-    artifacts.save(features, out)
-    artifacts.save(coarse, out)
     artifacts.save(_flow_table(dataset, camera, gathered.raw_xy, tools) if cfg.extract.flow else Flow(), out)
     write_association(out / "frames.txt", dataset, features.depth_stamp)
     write_camera(out, camera)
@@ -84,51 +83,53 @@ def assemble(found: Iterable[Frame], inputs: Inputs, out: Path, cfg: Config, too
         "frames": len(dataset),
         "features": int(n.sum()),
         "features_per_frame": [int(n.min()), float(np.median(n)), int(n.max())],
-        "with_depth": float(np.isfinite(features.depth).mean()) if len(features.depth) else 0.0,
+        "with_depth": gathered.n_with_depth / max(1, int(n.sum())),
         "frames_without_depth": int(np.isnan(features.depth_stamp).sum()),
         "bad_images": sum(len(faults) for faults in gathered.faults),
     } | doubt.to_summary(doubts)
 
 
 class _Gathered:
-    """What all frames gave: their features one after another in arrays reserved for the most there can be, of which the rest takes no memory."""
+    """What all frames gave: written as it comes where it has rows for each feature, which of a long recording would fill the memory."""
 
-    def __init__(self, n_frames: int, camera: Camera, settings: ExtractConfig) -> None:
+    def __init__(self, out: Path, camera: Camera, settings: ExtractConfig) -> None:
         self._camera, self._settings = camera, settings
-        most = n_frames * settings.features
-        self._columns: dict[str, np.ndarray] = {
-            "xy": np.empty((most, 2), np.float32),
-            "depth": np.empty(most, np.float32),
-            "slope": np.empty((most, 2), np.float32),
-            "octave": np.empty(most, np.uint8),
-            "angle": np.empty(most, np.float32),
-            "desc": np.empty((most, 32), np.uint8),
-        }
+        self._no_depth = coarse_images.code_of(np.zeros(icp.coarse_shape(camera), np.uint16))
+        self._features = artifacts.Writer(Features, out, "xy", "depth", "slope", "octave", "angle", "desc")
+        self._coarse = artifacts.Writer(CoarseDepth, out, "coarse_code")
+        self._coarse_offset = [0]
         self.offset = [0]
+        self.n_with_depth = 0  # features
         self.has_depth: list[bool] = []
-        self.codes = coarse_images.Codes(icp.coarse_shape(camera))
         self.faults: list[list[str]] = []
         self.readings: list[Readings | None] = []
         self.counts: list[np.ndarray] = []
         self.raw_xy: list[np.ndarray] = []  # (N, 2) px of each frame's key points, distorted, where they are to be followed
 
+    def __enter__(self) -> "_Gathered":
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self._features.__exit__(kind, error, trace)
+        self._coarse.__exit__(kind, error, trace)
+
     def add(self, frame: Frame) -> None:
         """Add the next frame."""
-        points, first = frame.points, self.offset[-1]
-        end = first + len(points)
-        new = {
-            "xy": self._camera.undistort(points.xy),
-            "depth": frame.depth,
-            "slope": frame.slope,
-            "octave": points.octave,
-            "angle": points.angle,
-            "desc": points.desc,
-        }
-        for name, values in new.items():
-            self._columns[name][first:end] = values
-        self.offset.append(end)
+        points = frame.points
+        self._features.append(
+            xy=self._camera.undistort(points.xy).astype(np.float32, copy=False),
+            depth=frame.depth,
+            slope=frame.slope,
+            octave=points.octave,
+            angle=points.angle,
+            desc=points.desc,
+        )
+        code = self._no_depth if frame.coarse is None else frame.coarse
+        self._coarse.append(coarse_code=np.frombuffer(code, dtype=np.uint8))
+        self.offset.append(self.offset[-1] + len(points))
+        self._coarse_offset.append(self._coarse_offset[-1] + len(code))
+        self.n_with_depth += int(np.isfinite(frame.depth).sum())
         self.has_depth.append(frame.coarse is not None)
-        self.codes.add(frame.coarse)
         self.faults.append(frame.faults)
         self.readings.append(frame.readings)
         if frame.counts is not None:
@@ -136,15 +137,16 @@ class _Gathered:
         if self._settings.flow:
             self.raw_xy.append(points.xy)
 
-    def features(self, dataset: Dataset) -> Features:
-        """Return the features of all frames."""
-        return Features(
+    def finish(self, dataset: Dataset) -> tuple[Features, CoarseDepth]:
+        """Complete what was written, and return it."""
+        features = self._features.finish(
             stamp=np.asarray(dataset.stamp, dtype=np.float64),
             depth_stamp=np.where(self.has_depth, dataset.depth_stamp, np.nan),
             offset=np.array(self.offset, dtype=np.int64),
             octave_scale=np.array(self._settings.scale),
-            **{name: column[: self.offset[-1]] for name, column in self._columns.items()},
         )
+        rows_and_columns = np.array(icp.coarse_shape(self._camera), dtype=np.int32)
+        return features, self._coarse.finish(coarse_shape=rows_and_columns, coarse_offset=np.array(self._coarse_offset, dtype=np.int64))
 
 
 def _doubts(dataset: Dataset, gathered: _Gathered, features: Features, coarse: CoarseImages) -> list[Finding]:

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from slamcli import artifacts
+from slamcli import artifacts, mapped_memory
 from slamcli.config.options import Config, MatchConfig
 from slamcli.formats import vocabulary_file
 from slamcli.parallel import ordered_map
@@ -18,30 +18,39 @@ from slamcli.vision import hamming, optical_flow, vocabulary
 def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
     """Quantize every feature, match each frame to those before it."""
     features, settings = inputs.load(Features, "extract"), cfg.match
-    words = _words(features, vocabulary_file.read(settings.vocabulary), settings)
+    words = _words(features, vocabulary_file.read(settings.vocabulary), settings, out)
     pairs = [(i, j) for i in range(len(features.stamp)) for j in range(max(0, i - settings.window), i)]
     flowed = inputs.load(Flow, "extract").flow_xy
-    match = partial(_match, features, words, flowed, settings)
-    found = list(tools.progress(ordered_map(match, pairs, workers=tools.workers), "match", len(pairs)))
-    matches = Matches(
-        pair=np.array(pairs, dtype=np.int32).reshape(-1, 2),
-        offset=np.cumsum([0] + [len(rows) for rows in found], dtype=np.int64),
-        row=np.concatenate([np.zeros((0, 2), np.int32), *found]),
-    )
-    artifacts.save(words, out)
-    artifacts.save(matches, out)
+    match, offset = partial(_match, features, words, flowed, settings), [0]
+    with artifacts.Writer(Matches, out, "row") as writer:
+        for rows in tools.progress(ordered_map(match, pairs, workers=tools.workers), "match", len(pairs)):
+            writer.append(row=rows)
+            offset.append(offset[-1] + len(rows))
+        matches = writer.finish(pair=np.array(pairs, dtype=np.int32).reshape(-1, 2), offset=np.array(offset, dtype=np.int64))
     return {
         "frames": len(features.stamp),
         "pairs": len(pairs),
         "matches_per_pair": float(np.median(np.diff(matches.offset))) if pairs else 0.0,
         "words": len(words.idf),
-        "words_seen": int((words.idf[np.unique(words.word)] > 0).sum()),
+        "words_seen": int((words.idf[_seen(words)] > 0).sum()),
     }
 
 
-def _words(features: Features, words: vocabulary.Vocabulary, settings: MatchConfig) -> Words:
-    word, node = vocabulary.quantize(words, features.desc, node_level=settings.node_level, margin=settings.node_margin)
-    return Words(idf=words.idf, word_offset=np.array(features.offset), word=word, node=node)
+def _words(features: Features, words: vocabulary.Vocabulary, settings: MatchConfig, out: Path) -> Words:
+    """Quantize all features and write their words."""
+    with artifacts.Writer(Words, out, "word", "node") as writer:
+        for rows in mapped_memory.blocks(features.desc):
+            word, node = vocabulary.quantize(words, features.desc[rows], node_level=settings.node_level, margin=settings.node_margin)
+            writer.append(word=word, node=node)
+        return writer.finish(idf=words.idf, word_offset=np.array(features.offset))
+
+
+def _seen(words: Words) -> np.ndarray:
+    """Say which words (W,) occur."""
+    is_seen = np.zeros(len(words.idf), dtype=bool)
+    for rows in mapped_memory.blocks(words.word):
+        is_seen[words.word[rows]] = True
+    return is_seen
 
 
 def _match(features: Features, words: Words, flowed: np.ndarray, settings: MatchConfig, pair: tuple[int, int]) -> np.ndarray:

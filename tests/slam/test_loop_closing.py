@@ -16,7 +16,6 @@ from slamcli.slam.loop_closing import LoopCloser
 from slamcli.slam.place_recognition import PlaceIndex
 from slamcli.slam.recording import TrackedRecording
 from slamcli.slam.tracker import Tracker
-from slamcli.sparse_map.frame import FrameStore
 from slamcli.sparse_map.sparse_map import SparseMap
 
 SENSOR, SETTINGS = SensorConfig(pixel_noise=0.5), LoopConfig()
@@ -151,16 +150,6 @@ def test_frames_of_one_key_frame_are_refined_together_whenever_they_were(turn, m
     n_frames = np.bincount(back_and_forth.ref_kf)
     assert n_frames[0] > 1
     assert len(asked) == sum(-(-n // frame_refinement.AT_ONCE) for n in n_frames), "once for so many frames of a key frame"
-
-
-def test_frames_that_were_refined_are_let_go_of(turn, monkeypatch):
-    scene, tracks, map_ = turn
-    released: list[FrameStore] = []
-    monkeypatch.setattr(FrameStore, "release", lambda self: released.append(self))
-    monkeypatch.setattr(frame_refinement, "KEPT", 25)
-    look = (SparseMap.from_map(scene.features, map_), TrackedRecording(scene.frames(SENSOR), tracks), TrackConfig(), silent)
-    frame_refinement.refine_frames(*look)
-    assert len(released) == len(tracks.state) // 25
 
 
 def test_final_refinement_matches_key_frames_again_and_the_world_stays_where_it_is(turn):
