@@ -8,7 +8,7 @@ import mmap
 import os
 import tempfile
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
@@ -61,9 +61,14 @@ def adopt(array: np.ndarray) -> None:
 
 def empty(shape: tuple[int, ...], dtype: np.typing.DTypeLike) -> np.ndarray:
     """Make an array, of any content; a large one within `bounded` in a file without a name. SlamError where the disk is too full for it."""
-    size = int(np.prod(shape, dtype=np.int64)) * np.dtype(dtype).itemsize
-    if not _room or size < LEAST_FILE:
-        return np.empty(shape, dtype)
+    return zeros(shape, dtype) if _has_file(shape, dtype) else np.empty(shape, dtype)
+
+
+def zeros(shape: tuple[int, ...], dtype: np.typing.DTypeLike) -> np.ndarray:
+    """Make an array of zeros where `empty` would make it."""
+    if not _has_file(shape, dtype):
+        return np.zeros(shape, dtype)
+    size = _bytes(shape, dtype)
     with files.written(_room[-1]), tempfile.TemporaryFile(dir=_room[-1]) as file:
         _reserve(file, size)
         mapped = mmap.mmap(file.fileno(), size)
@@ -73,9 +78,14 @@ def empty(shape: tuple[int, ...], dtype: np.typing.DTypeLike) -> np.ndarray:
 
 def copy(array: np.ndarray) -> np.ndarray:
     """Copy an array into one that `empty` makes."""
-    out = empty(array.shape, array.dtype)
-    for rows in blocks(array):
-        out[rows] = array[rows]
+    return by_blocks(lambda rows: array[rows], len(array), array.shape[1:], array.dtype)
+
+
+def by_blocks(values: Callable[[slice], np.ndarray], n: int, tail: tuple[int, ...], dtype: np.typing.DTypeLike) -> np.ndarray:
+    """Make an array (n, *tail) as `empty` does, a block of rows at a time, of what `values` gives for a slice of them."""
+    out = empty((n, *tail), dtype)
+    for rows in blocks(out):
+        out[rows] = values(rows)
         release_beyond(MOST_RESIDENT)
     return out
 
@@ -83,7 +93,7 @@ def copy(array: np.ndarray) -> np.ndarray:
 def blocks(array: np.ndarray) -> Iterator[slice]:
     """Divide the rows of an array into slices of AT_ONCE bytes."""
     step = max(1, AT_ONCE // max(1, array.nbytes // max(1, len(array))))
-    return (slice(first, first + step) for first in range(0, len(array), step))
+    return (slice(first, min(first + step, len(array))) for first in range(0, len(array), step))
 
 
 def release_beyond(most: int) -> None:
@@ -92,6 +102,14 @@ def release_beyond(most: int) -> None:
         with _lock:
             for mapped in _maps:
                 mapped.madvise(mmap.MADV_DONTNEED)
+
+
+def _bytes(shape: tuple[int, ...], dtype: np.typing.DTypeLike) -> int:
+    return int(np.prod(shape, dtype=np.int64)) * np.dtype(dtype).itemsize
+
+
+def _has_file(shape: tuple[int, ...], dtype: np.typing.DTypeLike) -> bool:
+    return bool(_room) and _bytes(shape, dtype) >= LEAST_FILE
 
 
 def _add(mapped: mmap.mmap) -> None:

@@ -15,7 +15,7 @@ CELL_VOXELS = 1 << CELL_BITS  # per side of the cells in which neighbours are so
 def not_stray(xyz: np.ndarray, key: np.ndarray, *, side: float, neighbours: int, max_deviation: float) -> np.ndarray:
     """Find the points that are as close to their neighbours as most: statistical outlier removal.
 
-    xyz : (N, 3) [m], one point a voxel
+    xyz : (N, 3) float32 [m], one point a voxel
     key : (N,) int64, the voxels' Morton keys, increasing, cell HALF_EXTENT starting at coordinate 0
     side : of a voxel [m]
     neighbours : whose mean distance is looked at; those farther than CELL_VOXELS voxels count as being so far
@@ -34,7 +34,7 @@ def not_stray(xyz: np.ndarray, key: np.ndarray, *, side: float, neighbours: int,
     distance = np.empty(len(xyz), dtype=np.float32)
     around, nearest = np.empty((27, 5), dtype=np.int64), np.empty(neighbours, dtype=np.float32)
     reach = np.float32(CELL_VOXELS * side)
-    _mean_distances(xyz.astype(np.float32), np.append(first, len(xyz)), cells.slot_row, cells.row_key, reach, around, nearest, distance)
+    _mean_distances(xyz, np.append(first, len(xyz)), cells.slot_row, cells.row_key, reach, around, nearest, distance)
     return distance <= distance.mean(dtype=np.float64) + max_deviation * distance.std(dtype=np.float64)
 
 

@@ -1,14 +1,16 @@
 """One coloured cloud from the surfaces that key frames see: averaged in voxels, stray points dropped.
 
-A voxel holds weighted sums only, so memory grows with the surface seen and not with the number of frames.
+A voxel holds weighted sums only, so that what is kept grows with the surface seen and not with the number of frames.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numba import f4, f8, i4, i8, u1
 
+from slamcli import mapped_memory
 from slamcli.dense import outlier_removal
 from slamcli.depth.oriented_points import Surface
 from slamcli.geometry import se3, voxel
@@ -33,8 +35,14 @@ class Cloud:
 
     def moved(self, T_ab: np.ndarray) -> "Cloud":
         """Return the cloud of frame b in frame a; the order stays."""
-        xyz = se3.transform(T_ab, self.xyz.astype(np.float64)).astype(np.float32)
-        return Cloud(xyz, self.rgb, se3.rotate(T_ab[:3, :3], self.normal).astype(np.float32))
+
+        def xyz(rows: slice) -> np.ndarray:
+            return se3.transform(T_ab, self.xyz[rows].astype(np.float64))
+
+        def normal(rows: slice) -> np.ndarray:
+            return se3.rotate(T_ab[:3, :3], self.normal[rows])
+
+        return Cloud(_vectors(xyz, len(self)), self.rgb, _vectors(normal, len(self)))
 
 
 class VoxelCloud:
@@ -65,14 +73,30 @@ class VoxelCloud:
         key = self._rows.row_key[row]
         order = np.argsort(key)
         row, key = row[order], key[order]
-        sums = self._rows.columns["sums"][row]
-        mean = sums / sums[:, WEIGHT]
-        xyz = (voxel.unmorton(key) - HALF_EXTENT + 0.5 + mean[:, OFFSET]) * self.side
-        length = np.linalg.norm(mean[:, NORMAL], axis=1, keepdims=True)
-        normal = mean[:, NORMAL] / np.where(length > 0, length, 1.0)
-        rgb = np.clip(np.rint(mean[:, RGB]), 0, 255).astype(np.uint8)
-        keep = outlier_removal.not_stray(xyz, key, side=self.side, neighbours=neighbours, max_deviation=max_deviation)
-        return Cloud(xyz[keep].astype(np.float32), rgb[keep], normal[keep])
+        sums = self._rows.columns["sums"]
+
+        def mean(rows: slice, columns: slice) -> np.ndarray:
+            return sums[row[rows], columns] / sums[row[rows], WEIGHT]
+
+        def xyz(rows: slice) -> np.ndarray:
+            return (voxel.unmorton(key[rows]) - HALF_EXTENT + 0.5 + mean(rows, OFFSET)) * self.side
+
+        def normal(rows: slice) -> np.ndarray:
+            sum_ = mean(rows, NORMAL)
+            length = np.linalg.norm(sum_, axis=1, keepdims=True)
+            return sum_ / np.where(length > 0, length, 1.0)
+
+        def rgb(rows: slice) -> np.ndarray:
+            return np.clip(np.rint(mean(rows, RGB)), 0, 255)
+
+        points = _vectors(xyz, len(row))
+        keep = outlier_removal.not_stray(points, key, side=self.side, neighbours=neighbours, max_deviation=max_deviation)
+        row, key = row[keep], key[keep]
+        return Cloud(_vectors(xyz, len(row)), mapped_memory.by_blocks(rgb, len(row), (3,), np.uint8), _vectors(normal, len(row)))
+
+
+def _vectors(values: Callable[[slice], np.ndarray], n: int) -> np.ndarray:
+    return mapped_memory.by_blocks(values, n, (3,), np.float32)
 
 
 class _Points(NamedTuple):

@@ -19,6 +19,7 @@ PLY_TYPE = {
 }  # fmt: skip
 PLY_NAME = {"f4": "float", "u1": "uchar"}
 MAX_HEADER = 65536  # bytes
+AT_ONCE = 1 << 18  # points put in order and written in turn
 MAX_POINTS = 1 << 30
 MAX_NUMBER = 64  # bytes of a number in a text file, with what separates it from the next
 PCD_KINDS = {
@@ -47,23 +48,30 @@ def _by_suffix(path: Path, functions: dict[str, Callable]) -> Callable:
 
 def write_ply(path: Path, xyz: np.ndarray, rgb: np.ndarray | None = None, normal: np.ndarray | None = None) -> None:
     """Write points as binary little-endian PLY."""
-    vertex = _vertices(xyz, rgb, normal)
     with files.whole(path) as file:
-        file.write(_ply_header(vertex, n_faces=None))
-        file.write(vertex.tobytes())
+        file.write(_ply_header(_vertices(*_rows(slice(0), xyz, rgb, normal)).dtype, len(xyz), n_faces=None))
+        _write_vertices(file, xyz, rgb, normal)
 
 
 def write_ply_mesh(
     path: Path, xyz: np.ndarray, triangle: np.ndarray, rgb: np.ndarray | None = None, normal: np.ndarray | None = None
 ) -> None:
     """Write a mesh as binary little-endian PLY: vertices as in `write_ply`, triangles (M, 3) of vertex rows."""
-    vertex = _vertices(xyz, rgb, normal)
     face = np.empty(len(triangle), dtype=[("n", "u1"), ("vertex", "<i4", 3)])
     face["n"], face["vertex"] = 3, triangle
     with files.whole(path) as file:
-        file.write(_ply_header(vertex, n_faces=len(face)))
-        file.write(vertex.tobytes())
+        file.write(_ply_header(_vertices(*_rows(slice(0), xyz, rgb, normal)).dtype, len(xyz), n_faces=len(face)))
+        _write_vertices(file, xyz, rgb, normal)
         file.write(face.tobytes())
+
+
+def _write_vertices(file: BinaryIO, xyz: np.ndarray, rgb: np.ndarray | None, normal: np.ndarray | None) -> None:
+    for first in range(0, len(xyz), AT_ONCE):
+        file.write(_vertices(*_rows(slice(first, first + AT_ONCE), xyz, rgb, normal)).tobytes())
+
+
+def _rows(rows: slice, xyz: np.ndarray, *others: np.ndarray | None) -> list:
+    return [xyz[rows], *(None if values is None else values[rows] for values in others)]
 
 
 def _vertices(xyz: np.ndarray, rgb: np.ndarray | None, normal: np.ndarray | None) -> np.ndarray:
@@ -76,9 +84,9 @@ def _vertices(xyz: np.ndarray, rgb: np.ndarray | None, normal: np.ndarray | None
     return out
 
 
-def _ply_header(vertex: np.ndarray, *, n_faces: int | None) -> bytes:
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertex)}"]
-    lines += [f"property {PLY_NAME[vertex.dtype[name].str[1:]]} {name}" for name in _names(vertex.dtype)]
+def _ply_header(vertex: np.dtype, n_vertices: int, *, n_faces: int | None) -> bytes:
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {n_vertices}"]
+    lines += [f"property {PLY_NAME[vertex[name].str[1:]]} {name}" for name in _names(vertex)]
     if n_faces is not None:
         lines += [f"element face {n_faces}", "property list uchar int vertex_indices"]
     return "\n".join([*lines, "end_header", ""]).encode()

@@ -7,6 +7,7 @@ consecutive keys are the children of one octree node. Keys are kept in int64, as
 import numpy as np
 from numba import i4, i8
 
+from slamcli import mapped_memory
 from slamcli.errors import SlamError
 from slamcli.jit.kernel import kernel
 
@@ -113,7 +114,7 @@ class VoxelRows:
             return
         if need > 1 << 29:
             raise SlamError(f"the map would need {need} voxels; choose larger ones")
-        # A factor of 1.5 keeps the peak while copying at 2.5 times the rows in use; 2 would make it 3.
+        # A factor of 1.5 keeps the room of both copies at 2.5 times the rows in use; 2 would make it 3.
         size = max(need, have + have // 2)
         self.row_key = _grown(self.row_key, size, 0)
         for name, (_, _, fill) in self._new.items():
@@ -124,7 +125,11 @@ class VoxelRows:
 
 
 def _grown(column: np.ndarray, size: int, fill: float) -> np.ndarray:
-    out = np.empty((size, *column.shape[1:]), dtype=column.dtype)
-    out[: len(column)] = column
-    out[len(column) :] = fill
+    """Copy a column into a longer one; zeros that nobody has written to take no memory."""
+    out = mapped_memory.zeros((size, *column.shape[1:]), column.dtype)
+    for rows in mapped_memory.blocks(column):
+        out[rows] = column[rows]
+        mapped_memory.release_beyond(mapped_memory.MOST_RESIDENT)
+    if fill != 0.0:
+        out[len(column) :] = fill
     return out

@@ -189,7 +189,7 @@ def test_strays_are_those_of_the_slow_twin(seed: int, neighbours: int) -> None:
     xyz = (cell + rng.uniform(0, 1, cell.shape)) * 0.01
     padded = np.vstack([xyz, np.full((9, 3), 1e3)])  # at least nine others, all beyond reach
     expected = distances(padded, 0.04, neighbours)[: len(xyz)]
-    keep = outlier_removal.not_stray(xyz, key, side=0.01, neighbours=neighbours, max_deviation=1.0)
+    keep = outlier_removal.not_stray(xyz.astype(np.float32), key, side=0.01, neighbours=neighbours, max_deviation=1.0)
     limit = expected.mean() + expected.std()
     clear = np.abs(expected - limit) > 1e-5
     assert (keep == (expected <= limit))[clear].all()
