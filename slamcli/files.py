@@ -244,8 +244,8 @@ def open_own(path: str | Path) -> TextIOWrapper:
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Read a JSON object; SlamError when the file is anything else."""
-    return _parse_json(path, _read_json_text(path))
+    """Read a JSON object, with or without a byte order mark; SlamError when the file is anything else."""
+    return _parse_json(path, _read_json_text(path).removeprefix("\ufeff"))
 
 
 def parse_toml(data: bytes, *, source: str) -> dict[str, Any]:

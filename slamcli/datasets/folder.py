@@ -2,6 +2,7 @@
 
 import os
 import re
+from collections.abc import Sequence
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from slamcli.errors import SlamError
@@ -23,7 +24,7 @@ class Folder:
 
     def files(self, below: str = "") -> list[str]:
         """List the files directly in a folder below the root, names only, sorted."""
-        return sorted(self._names(below).values())
+        return sorted(set(self._names(below).values()))
 
     def find(self, listed: str, homes: tuple[str, ...] = ()) -> str:
         """Return the file that a list means, relative to the root; the name as listed (tidied) where there is none.
@@ -109,6 +110,19 @@ def number_of(name: str) -> int | None:
     """Return the last number in a file's name without its suffix, such as 12 of "frame-000012.color.jpg"; None where it has none."""
     found = re.findall(r"\d+", PurePosixPath(name).name.split(".")[0]) or re.findall(r"\d+", PurePosixPath(name).stem)
     return int(found[-1][-MOST_DIGITS:]) if found else None
+
+
+def in_step(numbers: Sequence[int], others: dict[int, str], where: Path) -> tuple[dict[int, str], list[str]]:
+    """Return the images of a second stream by the numbers of the first, and what is to be said of it.
+
+    Where both count without a gap and end after as many images, but one from 0 on and the other from 1, say, they belong together in order.
+    """
+    theirs = sorted(others)
+    shift = theirs[0] - numbers[0] if theirs and numbers else 0
+    if shift == 0 or theirs != [number + shift for number in numbers] or theirs != list(range(theirs[0], theirs[0] + len(theirs))):
+        return others, []
+    said = f"{where}: depth images are numbered from {theirs[0]} on, colour from {numbers[0]}; paired in their order"
+    return {number - shift: name for number, name in others.items()}, [said]
 
 
 def numbered(folder: Folder, below: str, suffixes: tuple[str, ...], *, ending: str = "") -> dict[int, str]:

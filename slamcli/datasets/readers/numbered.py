@@ -8,7 +8,17 @@ import numpy as np
 
 from slamcli.datasets import images
 from slamcli.datasets.calibration import Calibration, find_calibration
-from slamcli.datasets.folder import COLOUR_FOLDERS, DEPTH_FOLDERS, DEPTH_SUFFIXES, IMAGE_SUFFIXES, Folder, number_of, numbered, subfolder
+from slamcli.datasets.folder import (
+    COLOUR_FOLDERS,
+    DEPTH_FOLDERS,
+    DEPTH_SUFFIXES,
+    IMAGE_SUFFIXES,
+    Folder,
+    in_step,
+    number_of,
+    numbered,
+    subfolder,
+)
 from slamcli.datasets.recorded import Recorded, Stream
 from slamcli.datasets.sources import ConfidentDepth, ImageFiles
 from slamcli.errors import BadFrame, SlamError
@@ -67,6 +77,7 @@ def _paired(
     path: Path, reader: str, calibration: Calibration, pictures: dict[int, str], depths: dict[int, str], depth_scale: float | None = None
 ) -> Recorded:
     """Pair images by number."""
+    depths, shifted = in_step(list(pictures), depths, path)
     if not any(number in depths for number in pictures):
         raise SlamError(
             f"{path}: none of {len(pictures)} colour images has the number of one of {len(depths)} depth images; "
@@ -83,7 +94,7 @@ def _paired(
         calibration=calibration,
         is_paired=True,
         depth_scale=depth_scale,
-        warnings=said,
+        warnings=shifted + said,
     )
 
 

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 
 from slamcli.datasets.calibration import Calibration, find_calibration
-from slamcli.datasets.folder import DEPTH_SUFFIXES, IMAGE_SUFFIXES, Folder, numbered
-from slamcli.datasets.intrinsics import from_numbers
+from slamcli.datasets.folder import DEPTH_SUFFIXES, IMAGE_SUFFIXES, Folder, in_step, numbered
+from slamcli.datasets.intrinsics import from_value
 from slamcli.datasets.recorded import Recorded, Stream
 from slamcli.datasets.sources import ImageFiles
 from slamcli.errors import SlamError
@@ -26,6 +26,7 @@ def read(path: Path) -> Recorded:
     about = read_json(path / "metadata.json")
     folder = Folder(path)
     colour, depth = numbered(folder, "rgb", IMAGE_SUFFIXES), numbered(folder, "depth", DEPTH_SUFFIXES)
+    depth, said = in_step(list(colour), depth, path)
     if not any(number in depth for number in colour):
         raise SlamError(f"{path}: no image of rgb/ has the number of one of depth/")
     calibration = find_calibration(path)
@@ -38,13 +39,14 @@ def read(path: Path) -> Recorded:
         calibration=calibration if calibration.values else intrinsics(about, path / "metadata.json"),
         is_paired=True,
         depth_scale=METRES if is_float else None,
+        warnings=said,
     )
 
 
 def intrinsics(about: dict[str, Any], source: Path) -> Calibration:
     """Read K, by columns, for pictures of w x h."""
     try:
-        values = from_numbers([float(value) for value in about["K"]])
+        values = from_value({"k": about["K"]})
         size = {"width": int(about["w"]), "height": int(about["h"])}
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise SlamError(f"{source}: has no intrinsics K for pictures of w x h; is it of Record3D?") from error

@@ -13,6 +13,7 @@ from slamcli.datasets.intrinsics import from_value
 from slamcli.datasets.recorded import Recorded, Stream
 from slamcli.datasets.sources import ImageFiles
 from slamcli.errors import SlamError
+from slamcli.geometry import elementary
 
 NAME = "transforms.json"
 MAX_BYTES = 256 << 20
@@ -59,7 +60,7 @@ def read(path: Path) -> Recorded:
 
 def _load(path: Path) -> dict[str, Any]:
     try:
-        about = json.loads(files.read_bytes(path, limit=MAX_BYTES).decode("utf-8"))
+        about = json.loads(files.read_bytes(path, limit=MAX_BYTES).decode("utf-8-sig"))
     except (ValueError, RecursionError, OSError) as error:
         raise SlamError(f"{path}: cannot be parsed ({error})") from error
     if not isinstance(about, dict) or not isinstance(about.get("frames"), list):
@@ -74,8 +75,8 @@ def _depth(folder: Folder, frame: dict[str, Any]) -> str:
 
 def _stamps(frames: list[dict[str, Any]]) -> np.ndarray | None:
     for key in TIME_KEYS:
-        values = [frame.get(key) for frame in frames]
-        if all(isinstance(value, (int, float)) and not isinstance(value, bool) for value in values):
+        values = [_number(frame.get(key)) for frame in frames]
+        if all(value is not None for value in values):
             return np.array(values, dtype=np.float64)
     return None
 
@@ -87,15 +88,35 @@ def _intrinsics(about: dict[str, Any], frames: list[dict[str, Any]]) -> dict[str
         return {key: value for key, value in whole.items() if key != "depth_scale"}
     each = [found for frame in frames if (found := from_value({**about, **frame}))]
     if not each:
-        return {}
+        return _from_angle(about)
     middle = {key: float(np.median([found[key] for found in each])) for key in ("fx", "fy", "cx", "cy")}
     return {key: value for key, value in {**each[0], **middle}.items() if key != "depth_scale"}
+
+
+def _number(value: Any) -> float | None:
+    """Read a number, one in quotes too; None for anything else, and for what is not finite."""
+    try:
+        number = float(value) if isinstance(value, (int, float, str)) and not isinstance(value, bool) else np.nan
+    except (ValueError, OverflowError):
+        return None
+    return number if np.isfinite(number) else None
+
+
+def _from_angle(about: dict[str, Any]) -> dict[str, float]:
+    """Work intrinsics out from the angle of view [rad] that Blender's scenes give, for pictures of w x h; {} where that is not all there."""
+    angle, width, height = (_number(about.get(key)) for key in ("camera_angle_x", "w", "h"))
+    if angle is None or width is None or height is None or not 0.0 < angle < np.pi:
+        return {}
+    fx = 0.5 * width / float(elementary.tan(0.5 * angle))
+    upright = _number(about.get("camera_angle_y"))
+    fy = 0.5 * height / float(elementary.tan(0.5 * upright)) if upright is not None and 0.0 < upright < np.pi else fx
+    return {"width": width, "height": height, "fx": fx, "fy": fy, "cx": 0.5 * (width - 1.0), "cy": 0.5 * (height - 1.0)}
 
 
 def _depth_scale(about: dict[str, Any]) -> float:
     """Return units per metre: nerfstudio's default is millimetres; NeRFCapture says by how much whole numbers were divided."""
     for key in ("depth_unit_scale_factor", "integer_depth_scale"):
-        value = about.get(key)
-        if isinstance(value, (int, float)) and not isinstance(value, bool) and value > 0:
+        value = _number(about.get(key))
+        if value is not None and value > 0.0:
             return 1.0 / value
     return 1000.0
