@@ -7,10 +7,15 @@ import numpy as np
 
 from slamcli.config.options import RecordingConfig
 from slamcli.datasets.association import MAX_DIFFERENCE, associate
-from slamcli.datasets.clock import Clock, read_clock
+from slamcli.datasets.clock import ENOUGH, MANY_REPEATED, Clock, read_clock
 from slamcli.datasets.folder import number_of
-from slamcli.datasets.recorded import Recorded
-from slamcli.errors import SlamError
+from slamcli.datasets.images import Pixels
+from slamcli.datasets.recorded import Recorded, Stream
+from slamcli.datasets.recording import spread
+from slamcli.datasets.sources import Images
+from slamcli.errors import BadFrame, SlamError
+
+LOOKED_AT = 5  # images that are compared with the one before
 
 
 @dataclass(frozen=True)
@@ -26,7 +31,7 @@ class Pairs:
 def pair(found: Recorded, fps: float | None) -> Pairs:
     """Pair colour and depth, by row where the reader did so, else by time; SlamError where nothing fits."""
     colour, depth = found.colour, found.depth
-    clock = read_clock(colour.stamp, len(colour), what=colour.where or str(found.root), fps=fps)
+    clock = _clock(colour, str(found.root), fps, is_paired=found.is_paired)
     warnings = list(clock.warnings)
     if fps and clock.is_clock:
         warnings.append(f"{found.root}: --fps {fps:g} is not used, as the recording has time stamps")
@@ -34,7 +39,7 @@ def pair(found: Recorded, fps: float | None) -> Pairs:
         raise SlamError(f"{found.root}: holds no colour image")
     if found.is_paired:
         return _by_row(found, clock, warnings)
-    depth_clock = read_clock(depth.stamp, len(depth), what=depth.where or str(found.root), fps=fps, shifts=clock.shifts)
+    depth_clock = _clock(depth, str(found.root), fps, shifts=clock.shifts)
     warnings += [w for w in depth_clock.warnings if w not in warnings]
     if not (clock.is_clock and depth_clock.is_clock) and not (clock.seconds and depth_clock.seconds):
         return _by_list(found, clock, warnings)
@@ -49,6 +54,45 @@ def pair(found: Recorded, fps: float | None) -> Pairs:
         depth_stamp=np.where(of_frame >= 0, depth_clock.stamp[of_frame], np.nan),
         warnings=warnings,
     )
+
+
+def _clock(stream: Stream, root: str, fps: float | None, *, is_paired: bool = False, shifts: tuple[float, ...] = ()) -> Clock:
+    """Judge a stream's stamps, images written twice left out."""
+    what = stream.where or root
+    if stream.stamp is None or is_paired or not (is_copy := _copies(stream)).any():
+        return read_clock(stream.stamp, len(stream), what=what, fps=fps, shifts=shifts)
+    rows = np.flatnonzero(~is_copy)
+    clock = read_clock(np.asarray(stream.stamp)[rows], len(rows), what=what, fps=fps, shifts=shifts)
+    said = f"{what}: {int(is_copy.sum())} images repeat the one before, stamp and content; left out"
+    return replace(clock, row=rows[clock.row], warnings=[said, *clock.warnings])
+
+
+def _copies(stream: Stream) -> np.ndarray:
+    """Find the images (N,) bool that repeat the one before, where so many stamps are repeated that they would be no clock.
+
+    A recorder that writes images twice is told from stamps that are too coarse by what a few of the images hold.
+    """
+    stamp = np.asarray(stream.stamp, dtype=np.float64)
+    is_copy, source = np.concatenate([[False], np.diff(stamp) == 0.0]), stream.images
+    if is_copy[1:].mean() <= MANY_REPEATED or (~is_copy).sum() < ENOUGH:
+        return np.zeros_like(is_copy)
+    is_copy[is_copy] = [source.n_bytes(int(i)) == source.n_bytes(int(i) - 1) for i in np.flatnonzero(is_copy)]
+    rows = np.flatnonzero(is_copy)
+    if not all(_are_equal(source, int(rows[k])) for k in spread(len(rows), LOOKED_AT)):
+        return np.zeros_like(is_copy)
+    return is_copy
+
+
+def _are_equal(source: Images, i: int) -> bool:
+    """Compare an image with the one before."""
+    try:
+        before, after = (source.read(row) for row in (i - 1, i))
+    except BadFrame:
+        return False
+    if isinstance(before, bytes) or isinstance(after, bytes):
+        return isinstance(before, bytes) and isinstance(after, bytes) and before == after
+    a, b = (image.data if isinstance(image, Pixels) else image for image in (before, after))
+    return np.array_equal(a, b, equal_nan=a.dtype.kind == "f")
 
 
 def _by_row(found: Recorded, clock: Clock, warnings: list[str]) -> Pairs:

@@ -152,6 +152,16 @@ def camera_with(**changes: object) -> tuple[str, str]:
     return "camera.json", json.dumps({**json.loads(CAMERA), **changes})
 
 
+def doubled(folder: Path) -> None:
+    """Write every image a second time, with the same stamp."""
+    for name in ("rgb", "depth"):
+        lines = [line for line in (folder / f"{name}.txt").read_text().splitlines() if not line.startswith("#")]
+        for line in lines:
+            file = folder / line.split()[1]
+            file.with_name(f"{file.stem}b{file.suffix}").write_bytes(file.read_bytes())
+        (folder / f"{name}.txt").write_text("".join(f"{line}\n{line.replace('.png', 'b.png')}\n" for line in lines))
+
+
 CASES = {
     # lists
     "semicolons": Case(rewrite(lambda t, f: f"{t:.6f};{f}")),
@@ -209,6 +219,8 @@ CASES = {
     "some stamps nan": Case(restamp(lambda t: np.where(np.arange(len(t)) % 10 == 3, np.nan, t)), said="4 unusable lines", frames=36, in_order=False),
     "a gap of a minute": Case(restamp(lambda t: t + 60.0 * (t > 0.51))),
     "one stamp twice": Case(restamp(lambda t: np.where(np.arange(len(t)) == 7, t[6], t)), said="1 repeated stamps", frames=39, in_order=False),
+    "each image twice, under another name": Case(doubled, said="40 images repeat the one before, stamp and content; left out"),
+    "stamps of a tenth of a second": Case(restamp(lambda t: np.floor(10 * t + 1e-9) / 10), said="no clock; 30 Hz assumed"),
     "depth of another epoch": Case(restamp(lambda t: t + EPOCH, names=("depth",)), said="no depth image lies within", refused=True),
     "depth at half the rate": Case(lambda d: reorder(lambda n: list(range(0, n, 2)))(d) or restore_rgb(d), with_depth=20),
     # pairs in one list
