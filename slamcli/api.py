@@ -327,10 +327,12 @@ def create_run(
     path: str | os.PathLike[str] | None = None,
     data: str | None = None,
     progress: Progress = silent,
+    opened: "Callable[[str, Config], Dataset | None]" = lambda target, config: None,
 ) -> "tuple[RunDir, Dataset, Config]":
     """Open the recording, or several that are to have one map, and make their run, or open the run that is there.
 
     resolve : gives the configuration under which to run, from the run's own; None where there is no run yet
+    opened : gives a recording that the caller has opened already under a configuration, or None
 
     No stage is run and no configuration written. Raises SlamError where several are given, but no `path`.
     """
@@ -341,18 +343,18 @@ def create_run(
             "several recordings make one map, whose run needs a name, such as -r runs/house; for a run of each: slamcli batch RECORDING..."
         )
 
-    def opened(config: Config) -> "list[Dataset]":
-        return [_opened(target, config, data, progress) for target in targets]
+    def open_all(config: Config) -> "list[Dataset]":
+        return [opened(target, config) or _opened(target, config, data, progress) for target in targets]
 
     if path is not None:
         RunDir(Path(path)).restore()
     first = resolve(RunDir(Path(path)).config() if path is not None else None)
-    datasets = opened(first)
+    datasets = open_all(first)
     place = Path(path) if path is not None else default_path(datasets[0].name)
     RunDir(place).restore()
     config = resolve(RunDir(place).config())
     if (config.camera, config.recording) != (first.camera, first.recording):  # an earlier command gave this run others
-        datasets = opened(config)
+        datasets = open_all(config)
     if len(datasets) > 1:
         return *_create_of_several(place, datasets), config
     (dataset,) = datasets

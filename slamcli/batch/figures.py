@@ -8,6 +8,7 @@ from typing import Any
 
 from slamcli import __version__
 from slamcli.batch import storage
+from slamcli.datasets import Dataset
 from slamcli.errors import SlamError
 from slamcli.evaluation import run_content, trajectory_error
 from slamcli.report import doubts
@@ -40,8 +41,11 @@ th,td{padding:.3em .7em;border-bottom:1px solid #d5dde5;text-align:left;vertical
 tr.failed td{background:#fdeeee}tr.doubted td{background:#fff8e5}tfoot td{font-weight:600}"""
 
 
-def of_run(run: RunDir) -> dict[str, Any]:
-    """Return the figures of a run as far as it went: coverage, APE where there is truth, what to doubt, and what it cost."""
+def of_run(run: RunDir, dataset: Dataset | None = None) -> dict[str, Any]:
+    """Return the figures of a run as far as it went: coverage, APE where there is truth, what to doubt, and what it cost.
+
+    dataset : the recording, where it is open already
+    """
     records = [record for name in NAMES if (record := run.record(name)) is not None]
     found: dict[str, Any] = {
         "seconds": round(sum(record["seconds"] for record in records), 1),
@@ -52,12 +56,12 @@ def of_run(run: RunDir) -> dict[str, Any]:
     }
     for record in records:
         found |= {name: record["summary"][name] for name in ("frames", "closures") if name in record["summary"]}
-    return found | (_judged(run) if any(record["stage"] in trajectory_error.STAGES for record in records) else {})
+    return found | (_judged(run, dataset) if any(record["stage"] in trajectory_error.STAGES for record in records) else {})
 
 
-def _judged(run: RunDir) -> dict[str, Any]:
+def _judged(run: RunDir, dataset: Dataset | None) -> dict[str, Any]:
     try:
-        content = run_content.collect(run)
+        content = run_content.collect(run, dataset)
     except SlamError:  # a recording that failed half-way: the reason stands in its row
         return {}
     ape = content.ape.get(content.stage)

@@ -19,7 +19,7 @@ from slamcli.batch import storage
 from slamcli.batch.jobs import Job
 from slamcli.config import toml
 from slamcli.config.options import Config
-from slamcli.datasets import open_dataset
+from slamcli.datasets import Dataset, open_dataset
 from slamcli.errors import SlamError
 from slamcli.jit import compilation
 from slamcli.parallel import one_thread_in_blas
@@ -100,7 +100,7 @@ def finish(job: Job, last: Done) -> dict[str, Any]:
         try:
             if not last.failure:
                 desk.open(job.order.until)
-            return {**row, **figures.of_run(desk.directory)}
+            return {**row, **figures.of_run(desk.directory, _last.recording_of(job))}
         except SlamError as error:
             return {**row, "state": "failed", "reason": str(error)}
 
@@ -108,6 +108,28 @@ def finish(job: Job, last: Done) -> dict[str, Any]:
 def clear(job: Job, dask_worker: Any = None) -> None:
     """Remove a worker's copies of what lies elsewhere; Dask passes the worker, as no task is running that could ask for it."""
     shutil.rmtree(_scratch(dask_worker) / job.name, ignore_errors=True)
+
+
+class _LastOpened:
+    """The recording that this worker opened last: the tasks of one follow on one another, and opening a long one takes a second."""
+
+    def __init__(self) -> None:
+        self._kept: tuple[Job, Config, Dataset] | None = None
+
+    def recording_of(self, job: Job, target: str = "", config: Config | None = None) -> Dataset | None:
+        """Return the recording of a job, opened under the same configuration, if that is the last; None otherwise."""
+        if self._kept is None or self._kept[0] != job:
+            return None
+        _, under, dataset = self._kept
+        is_same = config is None or (config.camera, config.recording) == (under.camera, under.recording)
+        return dataset if is_same else None
+
+    def keep(self, job: Job, config: Config, dataset: Dataset) -> None:
+        """Keep a recording until the next; a copy of what lies elsewhere is not kept, as another batch may bring another copy."""
+        self._kept = (job, config, dataset) if job.order.marker and not storage.is_url(job.recording) else None
+
+
+_last = _LastOpened()
 
 
 class Desk:
@@ -151,7 +173,10 @@ class Desk:
         """Bring the run up to date as far as `stage`, in general that stage alone."""
         target, order = self.open(stage), self.job.order
         logging.getLogger("slamcli").setLevel(logging.DEBUG)  # a run's log.txt has everything, here as from the command line
-        directory, dataset, config = api.create_run([target], resolve=self._resolve, path=self.directory.path, data=order.data)
+        directory, dataset, config = api.create_run(
+            [target], resolve=self._resolve, path=self.directory.path, data=order.data, opened=partial(_last.recording_of, self.job)
+        )
+        _last.keep(self.job, config, dataset)
         # Another process may still be at it for a client that has died since: what it makes is then found up to date.
         with api.writing(directory, config, wait=True):
             before = _written(directory, stage)

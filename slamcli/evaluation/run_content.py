@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from slamcli import schema
+from slamcli.datasets import Dataset
 from slamcli.errors import Damaged, SlamError
 from slamcli.evaluation import map_verdict, of_several, trajectory_error
 from slamcli.evaluation.map_verdict import Verdict
@@ -84,16 +85,18 @@ class Content:
         return self.states[stage].record.get("summary", {})
 
 
-def collect(run: RunDir) -> Content:
-    """Gather a run; it may have ended after any stage from track on."""
+def collect(run: RunDir, dataset: Dataset | None = None) -> Content:
+    """Gather a run; it may have ended after any stage from track on. `dataset` : its recording, where it is open already."""
     stage = trajectory_error.last_stage(run)
     times, map_, tracks = run.load(FrameTimes, stage), run.load(Map, stage), run.load(Tracks, stage)
     ground = run.load(Ground, "densify") if run.record("densify") is not None else None
     T_lw = ground.T_lw if ground is not None else UPRIGHT
     T_lc = T_lw @ schema.frame_poses(tracks, map_)
-    truth, no_truth = _truth(run)
+    dataset, not_there = (dataset, "") if dataset is not None else _opened(run)
+    truth, no_truth = _truth(dataset, not_there)
     ape = _ape(run, times.stamp, truth)
-    recording, doubts = _recording(run, stage)
+    recording = _recording(run, stage)
+    doubts = list(dataset.warnings) if dataset is not None else [not_there]
     states = run.states()
     return Content(
         name=str(run.info()["dataset"]),
@@ -121,9 +124,19 @@ def collect(run: RunDir) -> Content:
     )
 
 
-def _truth(run: RunDir) -> tuple[Trajectory | None, str]:
+def _opened(run: RunDir) -> tuple[Dataset | None, str]:
+    """Open the recording; None, and why, where it cannot be: it may be gone by now."""
     try:
-        truth = run.dataset().ground_truth()
+        return run.dataset(), ""
+    except SlamError as error:
+        return None, str(error)
+
+
+def _truth(dataset: Dataset | None, not_there: str) -> tuple[Trajectory | None, str]:
+    if dataset is None:
+        return None, not_there
+    try:
+        truth = dataset.ground_truth()
     except SlamError as error:
         return None, str(error)
     return truth, "" if truth is not None else "The recording has no ground truth, so errors cannot be given."
@@ -163,13 +176,10 @@ def _loops(run: RunDir, stage: str, map_: Map) -> np.ndarray:
     return map_.kf_frame[kf[(map_.kf_segment[kf] == 0).all(axis=1)]]
 
 
-def _recording(run: RunDir, stage: str) -> tuple[dict[str, Any], list[str]]:
-    """Describe the recording and say what its reader doubts; the recording itself may be gone by now."""
+def _recording(run: RunDir, stage: str) -> dict[str, Any]:
+    """Describe the recording by what the run holds of it."""
     made_by = "extract" if run.record("extract") is not None else stage
     about: dict[str, Any] = {"root": run.info()["root"], "camera": run.camera(made_by).to_dict()}
     placed = (run.record("loop") or {}).get("summary", {}).get("recordings", [])
     about["recordings"] = {row["name"]: f"{row['located']} of {row['frames']} frames in the common frame" for row in placed}
-    try:
-        return about, list(run.dataset().warnings)
-    except SlamError as error:
-        return about, [str(error)]
+    return about

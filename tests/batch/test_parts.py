@@ -2,6 +2,7 @@
 
 import shutil
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -9,6 +10,7 @@ from hypothesis import strategies as st
 
 pytest.importorskip("distributed", reason="batches need Dask: pip install 'slamcli[cluster]'")
 
+from slamcli import datasets
 from slamcli.batch import jobs, worker
 from slamcli.batch.jobs import Order
 from slamcli.batch.worker import Part, part_rows
@@ -64,3 +66,30 @@ def test_a_recording_that_cannot_be_read_fails_once_in_the_stage(job: jobs.Job, 
     parts = extracted(bad, 2)
     assert parts == [Part(()), Part(())]
     assert "rgb.txt" in worker.run_stage(bad, "extract", None, worker.identity(), parts).failure
+
+
+def test_a_batch_opens_a_recording_once_and_the_next_batch_looks_again(room: Path, here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    opened, really = list[str](), datasets.open_dataset
+
+    def counted(target: str, **how: Any) -> Any:
+        opened.append(target)
+        return really(target, **how)
+
+    monkeypatch.setattr(datasets, "open_dataset", counted)
+    recording = shutil.copytree(room, here / "room")
+
+    def batch(*settings: str) -> dict[str, Any]:
+        opened.clear()
+        with jobs.prepared(Order(out=str(here / "runs"), settings=settings, until="match")) as order:
+            (job,) = jobs.jobs([str(recording)], order)
+            done = None
+            for stage in job.stages:
+                done = worker.run_stage(job, stage, done, worker.identity())
+            assert done is not None
+            return worker.finish(job, done)
+
+    assert (batch()["frames"], len(opened)) == (40, 1)
+    colour = (recording / "rgb.txt").read_text().splitlines(keepends=True)
+    (recording / "rgb.txt").write_text("".join(colour[:-5]))
+    assert (batch()["frames"], len(opened)) == (35, 1)
+    assert (batch("recording.every=2")["frames"], len(opened)) == (18, 1)
