@@ -140,8 +140,9 @@ def normals(points: np.ndarray) -> np.ndarray:
     return out
 
 
-def sorted_points(depth, rays, T, corner, stride, above, ground, cell, near, far, low, high, drop, base, quadratic, side):
+def sorted_points(image, sight, noise, stride, above, ground, side):
     """Band points, their height slices, floor marks, holes and tops per cell, one pixel at a time, heights counted from `ground`."""
+    (depth, rays, T), (corner, cell, near, far, low, high, drop), (base, quadratic) = image, sight, noise
     n_band, layers = np.zeros((side, side), int), np.zeros((side, side), np.uint16)
     top, floor, hole = np.zeros((side, side), bool), np.zeros((side, side), int), np.zeros((side, side), int)
 
@@ -166,11 +167,11 @@ def sorted_points(depth, rays, T, corner, stride, above, ground, cell, near, far
                 continue
             x = point(v, u)
             slope = (x - T[:3, 3]) / z
-            noise = 2.0 * abs(slope[2]) * (base + quadratic * (z - 0.4) ** 2)
+            slack = 2.0 * abs(slope[2]) * (base + quadratic * (z - 0.4) ** 2)
             place = at(x[:2])
             is_level_here = is_level(v, u, x, slope)
             x[2] -= ground[place] if place else 0.0
-            if x[2] < -drop - noise:
+            if x[2] < -drop - slack:
                 height = 0.0
                 for _ in range(4):
                     reach = (T[2, 3] - height) / -slope[2]
@@ -185,10 +186,10 @@ def sorted_points(depth, rays, T, corner, stride, above, ground, cell, near, far
                 continue
             if x[2] >= high:
                 top[place] |= x[2] < high + 0.3 and is_level_here
-            elif x[2] >= low + noise:
+            elif x[2] >= low + slack:
                 n_band[place] += 1
                 layers[place] |= np.uint16(1 << int(16 * (x[2] - low) / (high - low)))
-            elif x[2] > -low - noise and is_level_here:
+            elif x[2] > -low - slack and is_level_here:
                 floor[place] = 2
                 back = min(low - max(x[2], 0.0), -z * slope[2]) / -slope[2]
                 steps = int(back * np.linalg.norm(slope[:2]) / cell)
@@ -199,8 +200,9 @@ def sorted_points(depth, rays, T, corner, stride, above, ground, cell, near, far
     return n_band, layers, floor, hole, top
 
 
-def crossed_slices(depth, rays, T, corner, stride, ground, cell, near, far, low, high, base, quadratic, side):
+def crossed_slices(image, sight, noise, stride, ground, side):
     """The slices of the band that lines of sight cross, as a set of (row, column, slice), one step along one pixel's line at a time."""
+    (depth, rays, T), (corner, cell, near, far, low, high, _), (base, quadratic) = image, sight, noise
     crossed = set()
     for v in range(stride // 2, depth.shape[0], stride):
         for u in range(stride // 2, depth.shape[1], stride):
@@ -223,8 +225,10 @@ def crossed_slices(depth, rays, T, corner, stride, ground, cell, near, far, low,
     return crossed
 
 
-def is_clear(standing, is_open, face, around, ground, row, column, camera_x, camera_y, camera_z, low, high, reach):
-    """Follow the line from a cell's floor to the camera, looking for something that hangs above it and may reach as far as the cell."""
+def is_clear(standing, is_open, face, around, ground, n, sight):
+    """Follow the line from cell `n`'s floor to the camera, looking for something that hangs above it and may reach as far as the cell."""
+    rows, columns, camera_x, camera_y, camera_z, low, high, reach = sight
+    row, column = rows[n], columns[n]
     start, end = np.array([column + 0.5, row + 0.5]), np.array([camera_x, camera_y])
     steps = int(np.ceil(np.abs(end - start).max()))
     for s in range(steps + 1):

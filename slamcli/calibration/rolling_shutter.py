@@ -6,6 +6,7 @@ depth delay, and from the camera's own motion; `rectify` takes them out.
 """
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numba import b1, f4, f8, i8
@@ -92,38 +93,46 @@ def rectify(features: Features, timing: Timing, camera: Camera) -> Features:
     the point's way through the image.
     """
     xy, depth = mapped_memory.copy(features.xy), mapped_memory.copy(features.depth)
+    offset, twist = np.array(features.offset, dtype=np.int64), np.ascontiguousarray(timing.twist, dtype=np.float64)
     _rectify(
-        np.array(features.offset, dtype=np.int64),
-        np.ascontiguousarray(timing.twist, dtype=np.float64),
-        depth_lag(features, timing),
+        _Frames(offset, twist, depth_lag(features, timing)),
         np.array([camera.fx, camera.fy, camera.cx, camera.cy, camera.height], dtype=np.float64),
-        float(timing.readout),
-        float(timing.depth_readout),
-        not np.isnan(timing.depth_delay),
-        np.ascontiguousarray(features.slope),
-        xy,
-        depth,
+        _Shutters(float(timing.readout), float(timing.depth_readout), not np.isnan(timing.depth_delay)),
+        _Measured(np.ascontiguousarray(features.slope), xy, depth),
     )
     return replace(features, xy=xy, depth=depth)
 
 
-@kernel(error_model="numpy")
-def _rectify(
-    offset: i8[::1],
-    twist: f8[:, ::1],
-    lag: f8[::1],
-    camera: f8[::1],
-    readout: f8,
-    depth_readout: f8,
-    moves_depth: b1,
-    slope: f4[:, ::1],
-    xy: f4[:, ::1],
-    depth: f4[::1],
-):
-    """Move xy (N, 2) [px] and depth (N,) [m] in place to what `flow` says of them at the colour stamp.
+class _Frames(NamedTuple):
+    """How the camera moved in F frames, and which measurements are of each."""
 
-    offset : (F + 1,) rows of each frame; lag : (F,) [s]; camera : fx, fy, cx, cy, height
-    """
+    offset: i8[::1]  # (F + 1,) rows of each frame
+    twist: f8[:, ::1]  # (F, 6) [m/s, rad/s]
+    lag: f8[::1]  # (F,) [s] by which depth was taken later than colour
+
+
+class _Shutters(NamedTuple):
+    """How long the two cameras read."""
+
+    readout: float  # [s] of the colour camera
+    depth_readout: float  # [s]
+    moves_depth: b1  # whether it is known when depth was taken
+
+
+class _Measured(NamedTuple):
+    """N measurements."""
+
+    slope: f4[:, ::1]  # (N, 2), as of `Features`
+    xy: f4[:, ::1]  # (N, 2) [px]
+    depth: f4[::1]  # (N,) [m], NaN = none
+
+
+@kernel(error_model="numpy")
+def _rectify(frames: _Frames, camera: f8[::1], shutters: _Shutters, measured: _Measured):
+    """Move xy and depth in place to what `flow` says of them at the colour stamp; camera : fx, fy, cx, cy, height."""
+    offset, twist, lag = frames
+    readout, depth_readout, moves_depth = shutters
+    slope, xy, depth = measured
     fx, fy, cx, cy, height = camera[0], camera[1], camera[2], camera[3], camera[4]
     for frame in range(len(offset) - 1):
         t0, t1, t2, w0, w1, w2 = twist[frame, 0], twist[frame, 1], twist[frame, 2], twist[frame, 3], twist[frame, 4], twist[frame, 5]

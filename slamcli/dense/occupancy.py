@@ -17,7 +17,7 @@ from slamcli.dense.ray_casting import OCCUPIED, mark_scan
 from slamcli.errors import SlamError
 from slamcli.geometry import elementary, voxel
 from slamcli.geometry.octree import CENTRE, DEPTH, Octree
-from slamcli.geometry.voxel import find_or_add, spread
+from slamcli.geometry.voxel import Index, find_or_add, spread
 from slamcli.jit.kernel import kernel
 
 BLOCK_CELLS = 512  # 8 x 8 x 8, within a block in Morton order
@@ -31,6 +31,14 @@ class Scan(NamedTuple):
     x: np.ndarray  # (N, 3) end points [m]
     origin: np.ndarray  # (3,) where the rays start [m]
     frame: int = 0
+
+
+class _Marked(NamedTuple):
+    """The cells that a scan marks, within the box of blocks that holds them."""
+
+    rows_of_8: u8[:, :, ::1]  # (Z, Y, X / 8) marks, eight cells along x in each number
+    lower: i8[::1]  # (3,) first cell
+    block_row: i4[:, :, ::1]  # (Z / 8, Y / 8, X / 8) row of each block, UNTOUCHED or TOUCHED
 
 
 class _Update(NamedTuple):
@@ -87,14 +95,13 @@ class OccupancyMap:
 
         Raises SlamError where the map would outgrow memory.
         """
-        marked = mark_scan(x_w, origin, max_range=max_range, resolution=self.resolution, discretize=discretize)
-        if marked is None:
+        found = mark_scan(x_w, origin, max_range=max_range, resolution=self.resolution, discretize=discretize)
+        if found is None:
             return
-        marks, lower = marked
-        rows_of_8 = marks.view(np.uint64)
-        block_row = np.full(np.array(marks.shape) >> 3, UNTOUCHED, dtype=np.int32)
+        marks, lower = found
+        marked = _Marked(marks.view(np.uint64), lower, np.full(np.array(marks.shape) >> 3, UNTOUCHED, dtype=np.int32))
         blocks = self._blocks
-        n_touched = _touch_blocks(rows_of_8, block_row)
+        n_touched = _touch_blocks(marked)
         if max(n_touched, blocks.n) > MAX_BLOCKS:
             size = MAX_BLOCKS * BLOCK_CELLS * sum(column.itemsize for column in blocks.columns.values()) / (1 << 30)
             raise SlamError(
@@ -102,7 +109,7 @@ class OccupancyMap:
             )
         blocks.reserve(n_touched)
         cells = _Cells(**blocks.columns)
-        blocks.n = _update_cells(rows_of_8, lower, block_row, blocks.slot_row, blocks.row_key, blocks.n, cells, self._update, frame)
+        blocks.n = _update_cells(marked, blocks.index, blocks.n, cells, self._update, frame)
 
     def doubted(self, misses: int) -> tuple[np.ndarray, np.ndarray]:
         """Find cells that are occupied, but that the last so many scans that touched them saw free.
@@ -111,7 +118,7 @@ class OccupancyMap:
         """
         columns = {name: column[: self._blocks.n] for name, column in self._blocks.columns.items()}
         block, local = np.nonzero((columns["log_odds"] > 0.0) & (columns["misses"] >= misses))
-        cell = voxel.unmorton((self._blocks.row_key[block] << 9) + local)
+        cell = voxel.unmorton((self._blocks.key[block] << 9) + local)
         return cell, columns["last_hit"][block, local]
 
     def centre(self, cell: np.ndarray) -> np.ndarray:
@@ -121,10 +128,10 @@ class OccupancyMap:
     def leaves(self) -> Octree:
         """Return the known cells as an octree that is not pruned."""
         n = self._blocks.n
-        order = np.argsort(self._blocks.row_key[:n])
+        order = np.argsort(self._blocks.key)
         value = self._blocks.columns["log_odds"][:n][order]
         row, local = np.nonzero(np.isfinite(value))
-        key = (self._blocks.row_key[:n][order][row] << 9) + local
+        key = (self._blocks.key[order][row] << 9) + local
         return Octree(self.resolution, key, np.full(len(key), DEPTH, dtype=np.uint8), value[row, local])
 
 
@@ -162,8 +169,9 @@ def accuracy(tree: Octree, scans: Iterable[Scan], *, max_range: float, threshold
 
 
 @kernel
-def _touch_blocks(rows_of_8: u8[:, :, ::1], block_row: i4[:, :, ::1]):
+def _touch_blocks(marked: _Marked):
     """Flag the blocks that hold a marked cell; returns their number."""
+    rows_of_8, _, block_row = marked
     n = 0
     for z in range(rows_of_8.shape[0]):
         for y in range(rows_of_8.shape[1]):
@@ -175,18 +183,9 @@ def _touch_blocks(rows_of_8: u8[:, :, ::1], block_row: i4[:, :, ::1]):
 
 
 @kernel
-def _update_cells(
-    rows_of_8: u8[:, :, ::1],
-    lower: i8[::1],
-    block_row: i4[:, :, ::1],
-    slot_row: i4[::1],
-    row_key: i8[::1],
-    n_rows: i8,
-    cells: _Cells,
-    by: _Update,
-    frame: i8,
-):
+def _update_cells(marked: _Marked, index: Index, n_rows: i8, cells: _Cells, by: _Update, frame: i8):
     """Update every marked cell once, (11) and (13) of Zhao et al. with clamping; returns the number of blocks."""
+    rows_of_8, lower, block_row = marked
     value, misses, last_hit = cells
     block_x, block_y, block_z = lower[0] >> 3, lower[1] >> 3, lower[2] >> 3
     for z in range(rows_of_8.shape[0]):
@@ -199,7 +198,7 @@ def _update_cells(
                 row = block_row[z >> 3, y >> 3, x]
                 if row == TOUCHED:
                     key = spread(x + block_x) | spread((y >> 3) + block_y) << 1 | spread((z >> 3) + block_z) << 2
-                    row = find_or_add(slot_row, row_key, n_rows, key)
+                    row = find_or_add(index, n_rows, key)
                     n_rows = max(n_rows, row + 1)
                     block_row[z >> 3, y >> 3, x] = row
                 for k in range(8):

@@ -1,10 +1,10 @@
 """Stray points of a voxel cloud."""
 
 import numpy as np
-from numba import f4, i4, i8
+from numba import f4, i8
 
 from slamcli.geometry import voxel
-from slamcli.geometry.voxel import find_or_add, find_row, gather, spread
+from slamcli.geometry.voxel import Index, find_or_add, find_row, gather, spread
 from slamcli.jit.kernel import kernel
 
 HALF_EXTENT = 1 << (voxel.AXIS_BITS - 1)  # voxels from the origin to the map's border, per axis
@@ -30,29 +30,27 @@ def not_stray(xyz: np.ndarray, key: np.ndarray, *, side: float, neighbours: int,
     first = np.flatnonzero(np.diff(cell_key, prepend=-1))
     cells = voxel.VoxelRows()
     cells.reserve(len(first))
-    _index_cells(cell_key[first], cells.slot_row, cells.row_key)
+    _index_cells(cell_key[first], cells.index)
     distance = np.empty(len(xyz), dtype=np.float32)
     around, nearest = np.empty((27, 5), dtype=np.int64), np.empty(neighbours, dtype=np.float32)
     reach = np.float32(CELL_VOXELS * side)
-    _mean_distances(xyz, np.append(first, len(xyz)), cells.slot_row, cells.row_key, reach, around, nearest, distance)
+    _mean_distances(xyz, np.append(first, len(xyz)), cells.index, reach, around, nearest, distance)
     return distance <= distance.mean(dtype=np.float64) + max_deviation * distance.std(dtype=np.float64)
 
 
 @kernel
-def _index_cells(key: i8[::1], slot_row: i4[::1], row_key: i8[::1]):
+def _index_cells(key: i8[::1], index: Index):
     for row in range(len(key)):
-        find_or_add(slot_row, row_key, row, key[row])
+        find_or_add(index, row, key[row])
 
 
 @kernel
-def _mean_distances(
-    xyz: f4[:, ::1], first: i8[::1], slot_row: i4[::1], row_key: i8[::1], reach: f4, around: i8[:, ::1], nearest: f4[::1], distance: f4[::1]
-):
+def _mean_distances(xyz: f4[:, ::1], first: i8[::1], index: Index, reach: f4, around: i8[:, ::1], nearest: f4[::1], distance: f4[::1]):
     """Fill each point's mean distance to its nearest neighbours, those beyond `reach`, a cell's side, counted at `reach`.
 
     around (27, 5), nearest (neighbours,) : room to work in; the first holds the point rows and the place of each cell round about
     """
-    neighbours = len(nearest)
+    neighbours, row_key = len(nearest), index.row_key
     half = 1 << (20 - CELL_BITS)
     zero = np.float32(0.0)
     for cell in range(len(first) - 1):
@@ -62,7 +60,7 @@ def _mean_distances(
             # The cell itself comes first: with its points known, most others are too far to matter.
             k = (k + 13) % 27
             x, y, z = k % 3 - 1, k // 3 % 3 - 1, k // 9 - 1
-            row = find_row(slot_row, row_key, spread(cx + x) | spread(cy + y) << 1 | spread(cz + z) << 2)
+            row = find_row(index, spread(cx + x) | spread(cy + y) << 1 | spread(cz + z) << 2)
             if row >= 0:
                 around[n_cells, 0], around[n_cells, 1] = first[row], first[row + 1]
                 around[n_cells, 2], around[n_cells, 3], around[n_cells, 4] = x, y, z

@@ -188,13 +188,14 @@ def _own(uv: f4[:, :, ::1], owner: i4[:, ::1]):
     """Write to each texel (S, S) the triangle in which its centre lies."""
     size = owner.shape[0]
     for m in range(len(uv)):
-        x0, y0, x1, y1, x2, y2 = _corners(uv, m, size)
-        area = (x1 - x0) * (y2 - y0) - (x2 - x0) * (y1 - y0)
+        corners = _corners(uv, m, size)
+        x0, y0, x1, y1, x2, y2 = corners
+        area = _doubled_area(corners)
         if area == 0.0:
             continue
         for i in range(max(math.floor(min(y0, y1, y2)), 0), min(math.ceil(max(y0, y1, y2)) + 1, size)):
             for j in range(max(math.floor(min(x0, x1, x2)), 0), min(math.ceil(max(x0, x1, x2)) + 1, size)):
-                a, b, c = _shares(j + 0.5, i + 0.5, x0, y0, x1, y1, x2, y2, area)
+                a, b, c = _shares(j + 0.5, i + 0.5, corners, area)
                 if a >= 0.0 and b >= 0.0 and c >= 0.0:
                     owner[i, j] = m
 
@@ -203,10 +204,10 @@ def _own(uv: f4[:, :, ::1], owner: i4[:, ::1]):
 def _weigh_corners(uv: f4[:, :, ::1], texel: i4[::1], first: i4[::1], size: i8, share: f4[:, ::1]):
     """Write the barycentric coordinates (N, 3) of texels (N,), sorted by their triangles, each with the rows from `first` (M + 1,) on."""
     for m in range(len(uv)):
-        x0, y0, x1, y1, x2, y2 = _corners(uv, m, size)
-        area = (x1 - x0) * (y2 - y0) - (x2 - x0) * (y1 - y0)
+        corners = _corners(uv, m, size)
+        area = _doubled_area(corners)
         for n in range(first[m], first[m + 1]):
-            a, b, c = _shares(texel[n] % size + 0.5, texel[n] // size + 0.5, x0, y0, x1, y1, x2, y2, area)
+            a, b, c = _shares(texel[n] % size + 0.5, texel[n] // size + 0.5, corners, area)
             share[n, 0], share[n, 1], share[n, 2] = a, b, c
 
 
@@ -220,10 +221,18 @@ def _corners(uv, m, size):
 
 
 @kernel
-def _shares(x, y, x0, y0, x1, y1, x2, y2, area):
-    """Return the barycentric coordinates of a place in a triangle whose doubled signed area is `area`."""
-    b = ((x - x0) * (y2 - y0) - (x2 - x0) * (y - y0)) / area
-    c = ((x1 - x0) * (y - y0) - (x - x0) * (y1 - y0)) / area
+def _doubled_area(corners):
+    """Return twice the signed area of a triangle [texels^2]."""
+    x0, y0, x1, y1, x2, y2 = corners
+    return (x1 - x0) * (y2 - y0) - (x2 - x0) * (y1 - y0)
+
+
+@kernel
+def _shares(x, y, corners, doubled_area):
+    """Return the barycentric coordinates of a place in a triangle."""
+    x0, y0, x1, y1, x2, y2 = corners
+    b = ((x - x0) * (y2 - y0) - (x2 - x0) * (y - y0)) / doubled_area
+    c = ((x1 - x0) * (y - y0) - (x - x0) * (y1 - y0)) / doubled_area
     return 1.0 - b - c, b, c
 
 

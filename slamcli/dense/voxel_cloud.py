@@ -14,7 +14,7 @@ from slamcli import mapped_memory
 from slamcli.dense import outlier_removal
 from slamcli.depth.oriented_points import Surface
 from slamcli.geometry import se3, voxel
-from slamcli.geometry.voxel import find_or_add, spread
+from slamcli.geometry.voxel import Index, find_or_add, spread
 from slamcli.jit.kernel import kernel
 
 HALF_EXTENT = outlier_removal.HALF_EXTENT
@@ -60,7 +60,7 @@ class VoxelCloud:
         points = _Points(seen.pixel, seen.xyz_c, seen.normal_c, seen.weight, np.ascontiguousarray(rgb).reshape(-1, 3))
         T_wc = np.ascontiguousarray(T_wc, dtype=np.float64)
         voxels = _Voxels(**rows.columns)
-        rows.n = _add_points(points, T_wc, 1.0 / self.side, rows.slot_row, rows.row_key, rows.n, voxels)
+        rows.n = _add_points(points, T_wc, 1.0 / self.side, rows.index, rows.n, voxels)
 
     def cloud(self, *, min_points: int = 1, neighbours: int = 0, max_deviation: float = np.inf) -> Cloud:
         """Return the voxels with at least `min_points` readings, in Morton order.
@@ -70,7 +70,7 @@ class VoxelCloud:
         """
         n = self._rows.n
         row = np.flatnonzero(self._rows.columns["count"][:n] >= min_points)
-        key = self._rows.row_key[row]
+        key = self._rows.key[row]
         order = np.argsort(key)
         row, key = row[order], key[order]
         sums = self._rows.columns["sums"]
@@ -117,7 +117,7 @@ class _Voxels(NamedTuple):
 
 
 @kernel
-def _add_points(points: _Points, T_wc: f8[:, ::1], per_side: f8, slot_row: i4[::1], row_key: i8[::1], n_rows: i8, voxels: _Voxels):
+def _add_points(points: _Points, T_wc: f8[:, ::1], per_side: f8, index: Index, n_rows: i8, voxels: _Voxels):
     """Add weighted points to their voxels. Returns the rows in use."""
     pixel, xyz_c, normal_c, weight, rgb = points
     sums, count = voxels
@@ -133,7 +133,7 @@ def _add_points(points: _Points, T_wc: f8[:, ::1], per_side: f8, slot_row: i4[::
             continue
         key = spread(int(fx) + half) | spread(int(fy) + half) << 1 | spread(int(fz) + half) << 2
         if key != last:  # neighbouring pixels often show the same voxel
-            last, row = key, np.int64(find_or_add(slot_row, row_key, n_rows, key))
+            last, row = key, np.int64(find_or_add(index, n_rows, key))
             n_rows = max(n_rows, row + 1)
         w = weight[i]
         a, b, c = normal_c[i, 0], normal_c[i, 1], normal_c[i, 2]

@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
-from numba import f4, f8, i4, i8
+from numba import b1, f4, f8, i4, i8
 
 from slamcli.geometry.cholesky import solve_damped
 from slamcli.geometry.se3 import left_update
@@ -44,6 +44,14 @@ class NormalEquations(NamedTuple):
     b: f8[::1]  # (6,)
 
 
+class _Round(NamedTuple):
+    """One round of Gauss-Newton."""
+
+    step: i8  # every so many-th point of j takes part
+    reach: f8  # [m] that points which meet may be apart
+    is_final: b1  # whether no step follows
+
+
 @kernel(error_model="numpy")
 def window_means(depth: f4[:, ::1], side: i8, first: i8, width: i8, out: f4[:, ::1]):
     """Average the middle of each block of `side` px of a depth image [m]: `width` px from `first` on, both ways.
@@ -68,8 +76,8 @@ def window_means(depth: f4[:, ::1], side: i8, first: i8, width: i8, out: f4[:, :
 
 
 @kernel(error_model="numpy")
-def _normal_equations(T, source, target, view, step, reach, rule, is_final, out):
-    """Write H = sum w J^T J and b = -sum w J^T r over every `step`-th point of j; return points met, points that agree, sum of w chi2.
+def _normal_equations(T, source, target, view, now, rule, out):
+    """Write H = sum w J^T J and b = -sum w J^T r over every `now.step`-th point of j; return points met, points that agree, sum of w chi2.
 
     r = n_i (q - x_i) is the distance from the plane of i, J = (n_i, q x n_i) its derivative by the left twist of T_ij, w its inverse
     variance times Huber's weight from chi2 = `rule.limit` on.
@@ -77,15 +85,12 @@ def _normal_equations(T, source, target, view, step, reach, rule, is_final, out)
     Normals err, and so add to H in directions in which nothing is known: over a plane, as if it were rough. In the end, therefore,
     H = sum w (J^T M + M^T J) / 2, with M the same of the normal of j: their errors are independent, and their products vanish on average.
     """
-    xyz_j, normal_j, variance_j, xyz_i, normal_i, variance_i = (
-        source.xyz,
-        source.normal,
-        source.variance,
-        target.xyz,
-        target.normal,
-        target.variance,
-    )
-    row_i, pinhole, min_cosine, limit, H, b = view.row, view.pinhole, rule.min_cosine, rule.limit, out.H, out.b
+    xyz_j, normal_j, variance_j = source
+    xyz_i, normal_i, variance_i = target
+    row_i, pinhole = view
+    min_cosine, limit, _ = rule
+    step, reach, is_final = now
+    H, b = out
     h00 = h01 = h02 = h03 = h04 = h05 = h11 = h12 = h13 = h14 = h15 = h22 = h23 = h24 = h25 = 0.0
     h33 = h34 = h35 = h44 = h45 = h55 = b0 = b1 = b2 = b3 = b4 = b5 = cost = 0.0
     T00, T01, T02, T03, T10, T11, T12, T13 = T[0, 0], T[0, 1], T[0, 2], T[0, 3], T[1, 0], T[1, 1], T[1, 2], T[1, 3]
@@ -182,13 +187,12 @@ def align(
     A, g, total, xi, L = np.empty((6, 6)), np.empty(6), np.zeros(6), np.empty(6), np.empty((6, 6))
     s, done = 0, 0
     while True:  # one call, so that what it calls is compiled into this kernel once
-        is_final = s == len(schedule)
-        step, reach = (1, schedule[s - 1, 1]) if is_final else (int(schedule[s, 0]), schedule[s, 1])
-        met, agree, cost = _normal_equations(T_ij, source, target, view, step, reach, rule, is_final, out)
-        if is_final:
+        now = _Round(1, schedule[s - 1, 1], True) if s == len(schedule) else _Round(int(schedule[s, 0]), schedule[s, 1], False)
+        met, agree, cost = _normal_equations(T_ij, source, target, view, now, rule, out)
+        if now.is_final:
             return met, agree, cost
         done += 1
-        weight = step / (rule.readings_as_one * max(cost / max(agree, 1), LEAST_VARIANCE_FACTOR))
+        weight = now.step / (rule.readings_as_one * max(cost / max(agree, 1), LEAST_VARIANCE_FACTOR))
         for i in range(6):
             g[i] = weight * out.b[i] + known.b[i]
             for j in range(6):

@@ -64,6 +64,13 @@ class ReducedSystem(NamedTuple):
     scratch: f8[:, :, ::1]  # (most observations of a landmark, 6, 3)
 
 
+class SharedGradient(NamedTuple):
+    """J_map^T w J of one number that all observations share."""
+
+    reduced: f8[:, ::1]  # (n, 6) of the free key frames, less what goes with the landmarks
+    lifted: f8[:, ::1]  # (L, 3) of the landmarks
+
+
 @kernel(error_model="numpy")
 def evaluate(at: Variables, seen: Sightings, measured: f8[:, ::1], camera: f8[::1], limits: f8[::1], chi2: f8[::1]):
     """Write chi2 (O,), 0 where switched off, and return the sum of Huber's costs."""
@@ -279,16 +286,17 @@ def shared_gradient(
     column: f8[:, ::1],
     W: f8[:, :, ::1],
     V_inv: f8[:, ::1],
-    reduced: f8[:, ::1],
-    lifted: f8[:, ::1],
+    to: SharedGradient,
 ):
-    """Add up J_landmark^T w J in lifted (L, 3) and J_pose^T w J, less what goes with the landmarks, in reduced (n, 6); both hold 0 before.
+    """Add up J_landmark^T w J and J_pose^T w J in arrays that hold 0 before.
 
+    W, V_inv : of a problem that is linearized and its landmarks eliminated
     column (O, 3) : of J, the growth of u, v [px] and depth [m]. The rows of J_pose and J_landmark are those of `linearize`.
     """
     T, x_w = at
     obs_kf, offset, place = seen
     fx, fy = camera[0], camera[1]
+    reduced, lifted = to
     for lm in range(len(x_w)):
         px, py, pz = x_w[lm, 0], x_w[lm, 1], x_w[lm, 2]
         for o in range(offset[lm], offset[lm + 1]):

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from slamcli.estimation import bundle_kernels as kernels
-from slamcli.estimation.bundle_kernels import NormalEquations, ReducedSystem, Sightings, Variables
+from slamcli.estimation.bundle_kernels import NormalEquations, ReducedSystem, SharedGradient, Sightings, Variables
 from slamcli.estimation.reduced_camera_system import order_and_blocks
 from slamcli.estimation.relative_pose_factors import NO_EDGES, Edges, EdgeTerms
 from slamcli.estimation.robust_loss import CHI2_95_2DOF, CHI2_95_3DOF, HUBER, Huber
@@ -161,7 +161,8 @@ class Problem:
         per_number = np.ascontiguousarray(columns.transpose(2, 0, 1))
         reduced, lifted = np.zeros((len(per_number), *self.rhs.shape)), np.zeros((len(per_number), *self.normal.b_l.shape))
         for g, column in enumerate(per_number):
-            kernels.shared_gradient(self.start, self._seen, used, self._camera, column, self.normal.W, self.V_inv, reduced[g], lifted[g])
+            to = SharedGradient(reduced[g], lifted[g])
+            kernels.shared_gradient(self.start, self._seen, used, self._camera, column, self.normal.W, self.V_inv, to)
         return reduced.reshape(len(reduced), -1), lifted
 
     def step(self, at: Variables, damping: float) -> Step:

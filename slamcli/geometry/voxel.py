@@ -4,6 +4,8 @@ A Morton key interleaves the bits of three non-negative cell numbers, x lowest: 
 consecutive keys are the children of one octree node. Keys are kept in int64, as 3 * 21 bits fit and mixing uint64 with int64 gives floats.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import i4, i8
 
@@ -51,6 +53,13 @@ def unmorton(key: np.ndarray) -> np.ndarray:
     return np.stack([_gather(key), _gather(key >> 1), _gather(key >> 2)], axis=-1)
 
 
+class Index(NamedTuple):
+    """The row of each key: open addressing with linear probing."""
+
+    slot_row: i4[::1]  # (C,) row whose key is in a slot, -1 = empty; C a power of two
+    row_key: i8[::1]  # (R,)
+
+
 @kernel
 def first_slot(key, mask):
     """Return the slot a key's search starts at; the eight children of a node share a cache line."""
@@ -58,8 +67,9 @@ def first_slot(key, mask):
 
 
 @kernel
-def find_row(slot_row, row_key, key):
+def find_row(index, key):
     """Return the row of a key, -1 where it has none."""
+    slot_row, row_key = index
     mask = slot_row.size - 1
     slot = first_slot(key, mask)
     while slot_row[slot] >= 0:
@@ -70,8 +80,9 @@ def find_row(slot_row, row_key, key):
 
 
 @kernel
-def find_or_add(slot_row, row_key, n_rows, key):
+def find_or_add(index, n_rows, key):
     """Return the row of a key; a new key gets row `n_rows`, and it is the caller who counts on. The table must have room."""
+    slot_row, row_key = index
     mask = slot_row.size - 1
     slot = first_slot(key, mask)
     while slot_row[slot] >= 0:
@@ -84,7 +95,8 @@ def find_or_add(slot_row, row_key, n_rows, key):
 
 
 @kernel
-def _fill_slots(slot_row: i4[::1], row_key: i8[::1], n_rows: i8):
+def _fill_slots(index: Index, n_rows: i8):
+    slot_row, row_key = index
     mask = slot_row.size - 1
     for row in range(n_rows):
         slot = first_slot(row_key[row], mask)
@@ -94,34 +106,38 @@ def _fill_slots(slot_row: i4[::1], row_key: i8[::1], n_rows: i8):
 
 
 class VoxelRows:
-    """Rows by key: open addressing with linear probing, at most half full, and the row columns that grow with it.
+    """Rows by key, found by an index that is at most half full, and the row columns that grow with it.
 
-    Attributes: `slot_row` (C,) int32, -1 = empty, C a power of two; `row_key` (R,) int64; `n` rows in use; `columns`, each (R, ...).
+    Attributes: `index`; `n` rows in use; `columns`, each (R, ...).
     """
 
     def __init__(self, **columns: tuple[tuple[int, ...], type[np.generic], float]) -> None:
         """Declare columns as name=(shape of a row, dtype, value of a new row)."""
         self._new = columns
         self.n = 0
-        self.slot_row = np.full(2048, -1, dtype=np.int32)
-        self.row_key = np.zeros(1024, dtype=np.int64)
+        self.index = Index(np.full(2048, -1, dtype=np.int32), np.zeros(1024, dtype=np.int64))
         self.columns = {name: np.full((1024, *shape), fill, dtype=dtype) for name, (shape, dtype, fill) in columns.items()}
+
+    @property
+    def key(self) -> np.ndarray:
+        """The keys (n,) int64 of the rows in use."""
+        return self.index.row_key[: self.n]
 
     def reserve(self, n_more: int) -> None:
         """Make room for `n_more` further rows."""
-        need, have = self.n + n_more, len(self.row_key)
+        need, have = self.n + n_more, len(self.index.row_key)
         if need <= have:
             return
         if need > 1 << 29:
             raise SlamError(f"the map would need {need} voxels; choose larger ones")
         # A factor of 1.5 keeps the room of both copies at 2.5 times the rows in use; 2 would make it 3.
         size = max(need, have + have // 2)
-        self.row_key = _grown(self.row_key, size, 0)
+        self.index = self.index._replace(row_key=_grown(self.index.row_key, size, 0))
         for name, (_, _, fill) in self._new.items():
             self.columns[name] = _grown(self.columns[name], size, fill)
-        if 2 * size > len(self.slot_row):
-            self.slot_row = np.full(1 << int(2 * size - 1).bit_length(), -1, dtype=np.int32)
-            _fill_slots(self.slot_row, self.row_key, self.n)
+        if 2 * size > len(self.index.slot_row):
+            self.index = self.index._replace(slot_row=np.full(1 << int(2 * size - 1).bit_length(), -1, dtype=np.int32))
+            _fill_slots(self.index, self.n)
 
 
 def _grown(column: np.ndarray, size: int, fill: float) -> np.ndarray:

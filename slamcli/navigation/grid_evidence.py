@@ -47,6 +47,14 @@ class View:
     levels: Levels = NO_LEVELS  # heights of level surfaces, floor among them
 
 
+class DepthImage(NamedTuple):
+    """A depth image, and where it was taken."""
+
+    depth: f4[:, ::1]  # (H, W) [m], NaN = none
+    rays: f4[:, :, ::1]  # (H, W, 2), of `Camera.rays`
+    T_lk: f8[:, ::1]  # (4, 4) camera to level
+
+
 class Sight(NamedTuple):
     """Where depth is sorted into cells, and what counts."""
 
@@ -95,15 +103,15 @@ def look(
         raise SlamError("grid2d: a key frame lies absurdly far away; check the trajectory")
     side = 2 * half + 1
     seen, crossed = blank_cells(side), np.zeros((side, side), dtype=np.uint16)
-    depth, T_lk = np.ascontiguousarray(depth, dtype=np.float32), np.ascontiguousarray(T_lk, dtype=np.float64)
+    image = DepthImage(np.ascontiguousarray(depth, dtype=np.float32), rays, np.ascontiguousarray(T_lk, dtype=np.float64))
     sight = Sight(centre - half, cell, settings.min_range, settings.max_range, settings.band_low, settings.band_high, settings.drop)
     noise = noise_model.depth_noise(sensor)
     first = centre.astype(np.int64) - half
     ground, above = floor.window(first, (side, side)), max(settings.stride, depth.shape[0] // ROWS)
-    _sort_points(depth, rays, T_lk, sight, noise, settings.stride, above, ground, seen)
-    _cross(depth, rays, T_lk, sight, noise, OPEN_STRIDE * settings.stride, ground, crossed)
+    _sort_points(image, sight, noise, settings.stride, above, ground, seen)
+    _cross(image, sight, noise, OPEN_STRIDE * settings.stride, ground, crossed)
     if settings.extend_down:
-        _extend_down(depth, rays, T_lk, centre - half, settings, seen.n_band, seen.slices)
+        _extend_down(image, centre - half, settings, seen)
     rows, columns = np.nonzero((seen.n_band > 0) | (seen.floor > 0) | (seen.hole >= HOLE_POINTS) | (seen.top > 0))
     open_rows, open_columns = np.nonzero(crossed)
     return View(
@@ -116,30 +124,21 @@ def look(
         camera=T_lk[:3, 3].copy(),
         open_cell=np.stack([open_columns + first[0], open_rows + first[1]], axis=1).astype(np.int32),
         open_slices=crossed[open_rows, open_columns],
-        levels=_levels(depth, rays, T_lk, sight, OPEN_STRIDE * settings.stride, above) if settings.max_slope > 0.0 else NO_LEVELS,
+        levels=_levels(image, sight, OPEN_STRIDE * settings.stride, above) if settings.max_slope > 0.0 else NO_LEVELS,
     )
 
 
-def _levels(depth: np.ndarray, rays: np.ndarray, T_lk: np.ndarray, sight: Sight, stride: int, above: int) -> Levels:
+def _levels(image: DepthImage, sight: Sight, stride: int, above: int) -> Levels:
     """Gather the heights of level surfaces, floor and table tops alike, at every `stride`-th pixel."""
-    most = -(-depth.shape[0] // stride) * -(-depth.shape[1] // stride)
-    cell, height = np.empty((most, 2), dtype=np.int32), np.empty(most)
-    n = _gather_levels(depth, rays, T_lk, sight, stride, above, cell, height)
-    return terrain.add_up(cell[:n], height[:n])
+    height, width = image.depth.shape
+    most = -(-height // stride) * -(-width // stride)
+    cell, level = np.empty((most, 2), dtype=np.int32), np.empty(most)
+    n = _gather_levels(image, sight, stride, above, cell, level)
+    return terrain.add_up(cell[:n], level[:n])
 
 
 @kernel
-def _sort_points(
-    depth: f4[:, ::1],
-    rays: f4[:, :, ::1],
-    T: f8[:, ::1],
-    sight: Sight,
-    noise: DepthNoise,
-    stride: i8,
-    above: i8,
-    ground: f4[:, ::1],
-    seen: Cells,
-):
+def _sort_points(image: DepthImage, sight: Sight, noise: DepthNoise, stride: i8, above: i8, ground: f4[:, ::1], seen: Cells):
     """Count band points per cell; mark cells whose floor is seen or over which a line of sight passes below the band, holes, and tops.
 
     A line of sight that ends deeper than `drop` below the floor makes the cell in which it crosses the floor's plane a hole; the cells
@@ -150,6 +149,7 @@ def _sort_points(
     above : rows up to the pixel that tells whether a surface is level
     ground : (S, S) [m] height of the floor in the cells, from which heights are counted
     """
+    depth, rays, T = image
     corner, cell, near, far, low, high, drop = sight
     n_band, slices, floor, hole, top = seen
     side = n_band.shape[0]
@@ -174,14 +174,14 @@ def _sort_points(
             if not (0 <= i < side and 0 <= j < side):
                 continue
             if height >= high:
-                if dz < 0.0 and v >= above and _is_level(depth, rays, T, u, v, above, z, dz):
+                if dz < 0.0 and v >= above and _is_level(image, u, v, above, z, dz):
                     top[i, j] = 1
             elif height >= low + slack:
                 n_band[i, j] += 1
                 slices[i, j] |= np.uint16(1 << int(SLICES * (height - low) / (high - low)))
             elif height > -low - slack and dz < 0.0 and v >= above:
                 # The pixel `above` must be as low, or this is the foot of something upright, which noise may have put behind it.
-                if not _is_level(depth, rays, T, u, v, above, z, dz):
+                if not _is_level(image, u, v, above, z, dz):
                     continue
                 floor[i, j] = SEEN
                 rise = low - height if height > 0.0 else low
@@ -227,24 +227,17 @@ def _height(ground, x, y):
 
 
 @kernel
-def _is_level(depth, rays, T, u, v, above, z, dz):
+def _is_level(image, u, v, above, z, dz):
     """Say whether the surface at a pixel of depth z rises to the pixel `above` by less than half of what an upright one would."""
+    depth, rays, T = image
     dz2 = T[2, 0] * rays[v - above, u, 0] + T[2, 1] * rays[v - above, u, 1] + T[2, 2]
     return abs(depth[v - above, u] * dz2 - z * dz) < 0.5 * z * (dz2 - dz)
 
 
 @kernel
-def _gather_levels(
-    depth: f4[:, ::1],
-    rays: f4[:, :, ::1],
-    T: f8[:, ::1],
-    sight: Sight,
-    stride: i8,
-    above: i8,
-    cells: i4[:, ::1],
-    heights: f8[::1],
-):
+def _gather_levels(image: DepthImage, sight: Sight, stride: i8, above: i8, cells: i4[:, ::1], heights: f8[::1]):
     """Write cell (N, 2), column and row, and height (N,) [m] of each point of a level surface that is seen from above; return their number."""
+    depth, rays, T = image
     _, cell, near, far, _, _, _ = sight
     n = 0
     for v in range(stride // 2, depth.shape[0], stride):
@@ -254,7 +247,7 @@ def _gather_levels(
                 continue
             rx, ry = rays[v, u, 0], rays[v, u, 1]
             dz = T[2, 0] * rx + T[2, 1] * ry + T[2, 2]
-            if not (dz < 0.0 and _is_level(depth, rays, T, u, v, above, z, dz)):
+            if not (dz < 0.0 and _is_level(image, u, v, above, z, dz)):
                 continue
             cells[n, 0] = math.floor((T[0, 3] + z * (T[0, 0] * rx + T[0, 1] * ry + T[0, 2])) / cell)
             cells[n, 1] = math.floor((T[1, 3] + z * (T[1, 0] * rx + T[1, 1] * ry + T[1, 2])) / cell)
@@ -264,20 +257,12 @@ def _gather_levels(
 
 
 @kernel
-def _cross(
-    depth: f4[:, ::1],
-    rays: f4[:, :, ::1],
-    T: f8[:, ::1],
-    sight: Sight,
-    noise: DepthNoise,
-    stride: i8,
-    ground: f4[:, ::1],
-    crossed: u2[:, ::1],
-):
+def _cross(image: DepthImage, sight: Sight, noise: DepthNoise, stride: i8, ground: f4[:, ::1], crossed: u2[:, ::1]):
     """Mark, as bits per cell, the slices of the band that lines of sight cross: up to a cell and the noise before their end, or to `far`.
 
     A reading beyond `far` is too inexact to be a point, but tells that nothing is nearer.
     """
+    depth, rays, T = image
     corner, cell, near, far, low, high, _ = sight
     side = crossed.shape[0]
     lowest, highest = low + min(ground.min(), 0.0), high + max(ground.max(), 0.0)
@@ -316,14 +301,14 @@ def _cross(
                         crossed[i, j] |= np.uint16(1 << at)
 
 
-def _extend_down(
-    depth: np.ndarray, rays: np.ndarray, T_lk: np.ndarray, corner: np.ndarray, s: GridConfig, n_band: np.ndarray, slices: np.ndarray
-) -> None:
+def _extend_down(image: DepthImage, corner: np.ndarray, s: GridConfig, seen: Cells) -> None:
     """Count upright surfaces that leave the picture downwards above the band as standing in it: a box seen from close by, a wall.
 
     Upright: over a twelfth of the picture, 5 cm at 0.7 m and so more than the edge of a table top, the height changes by three times
     as much as the place.
     """
+    depth, rays, T_lk = image
+    n_band, slices = seen.n_band, seen.slices
     height, width = depth.shape
     u = np.arange(s.stride // 2, width, s.stride)
     lowest = depth[height - height // LOWEST :, u][::-1]

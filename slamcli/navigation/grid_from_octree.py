@@ -4,6 +4,8 @@ The octree tells what no single line of sight does: how much of a column is unkn
 that hangs, it may be the inside of it; such columns stay unknown however well the floor below is seen.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 from scipy import ndimage
 
@@ -16,6 +18,25 @@ from slamcli.navigation.grid_evidence import SLICES
 from slamcli.schema import Grid
 
 EDGE = 1e-6  # [cells] a leaf that ends on a border does not reach beyond it
+
+
+class _Leaves(NamedTuple):
+    """N leaves between the floor and the upper end of the band."""
+
+    first: np.ndarray  # (N, 2) int64, column and row of the first cell that each covers
+    last: np.ndarray  # (N, 2) int64, and of the last
+    slices: np.ndarray  # (N,) uint16, see `_slices`
+    is_occupied: np.ndarray  # (N,) bool
+    log_odds: np.ndarray  # (N,) float32
+
+
+class _Columns(NamedTuple):
+    """What leaves say of each column (H, W)."""
+
+    full: np.ndarray  # uint16, bits: slices of the band with an occupied leaf
+    free: np.ndarray  # uint16, with a free one
+    known: np.ndarray  # int32, leaves
+    odds: np.ndarray  # float32, greatest log-odds in the band
 
 
 def grid_from_octree(tree: Octree, *, settings: GridConfig) -> Grid:
@@ -33,10 +54,10 @@ def grid_from_octree(tree: Octree, *, settings: GridConfig) -> Grid:
     corner = first.min(axis=0)
     columns, rows = (int(n) for n in last.max(axis=0) - corner + 1)
     check_size(rows, columns, resolution)
-    slices = _slices(low[:, 2], high[:, 2], settings)
+    leaves = _Leaves(first - corner, last - corner, _slices(low[:, 2], high[:, 2], settings), is_occupied, log_odds)
     full, free = np.zeros((rows, columns), np.uint16), np.zeros((rows, columns), np.uint16)
     known, odds = np.zeros((rows, columns), np.int32), np.full((rows, columns), -np.inf, np.float32)
-    _fill(first - corner, last - corner, slices, is_occupied, log_odds, full, free, known, odds)
+    _fill(leaves, _Columns(full, free, known, odds))
     is_known = (known > 0) & ~may_be_inside(full, free, reach=int(np.ceil(DEEPEST / resolution)))
     state = np.full((rows, columns), UNKNOWN, dtype=np.int8)
     state[is_known] = FREE
@@ -68,7 +89,9 @@ def _slices(low: np.ndarray, high: np.ndarray, settings: GridConfig) -> np.ndarr
 
 
 @kernel
-def _fill(first, last, slices, is_occupied, log_odds, full, free, known, odds):
+def _fill(leaves, columns):
+    first, last, slices, is_occupied, log_odds = leaves
+    full, free, known, odds = columns
     for n in range(len(slices)):
         mask = slices[n]
         for i in range(first[n, 1], last[n, 1] + 1):

@@ -1,8 +1,11 @@
 """Kernels of background_motion.py: which matches, and how much surface, agree with a motion."""
 
-import numpy as np
-from numba import b1, f4, f8, i4
+from typing import NamedTuple
 
+import numpy as np
+from numba import b1, f4, f8
+
+from slamcli.depth.icp_kernels import Points, View
 from slamcli.geometry import depth_noise
 from slamcli.geometry.depth_noise import DepthNoise
 from slamcli.jit.kernel import kernel
@@ -13,40 +16,50 @@ LEAST_COSINE = 0.25  # of a surface seen more slantingly, that its area is divid
 SAME_NORMAL = 0.8  # cosine between the normals of points on one surface
 
 
+class Matches(NamedTuple):
+    """N points of the reference, and where the frame sees them."""
+
+    x_r: f8[:, ::1]  # (N, 3) [m]
+    xy: f8[:, ::1]  # (N, 2) [px]
+    depth: f8[::1]  # (N,) [m], NaN = unknown
+    inv_px: f8[::1]  # (N,) [1/px] 1 / sigma
+    inv_z: f8[::1]  # (N,) [1/m]
+    weight: f8[::1]  # (N,) what the votes of each count
+
+
 @kernel
-def vote(
-    T: f8[:, :, ::1], x_r: f8[:, ::1], xy: f8[:, ::1], depth: f8[::1], inv_px: f8[::1], inv_z: f8[::1], weight: f8[::1],
-    pinhole: f8[::1], chi2: f8, agrees: b1[::1],
-):  # fmt: skip
+def vote(T: f8[:, :, ::1], matches: Matches, pinhole: f8[::1], chi2: f8, agrees: b1[::1]):
     """Find the motion T (M, 3 or 4, 4) with which matches of the greatest total weight agree; write these; return its number and the weight.
 
     The better a match agrees, the more of its weight counts (P. Torr, A. Zisserman, CVIU 2000, doi:10.1006/cviu.1999.0832).
-    Point x_r[i] is to be seen at xy[i] in depth[i], NaN = unknown. A motion that is not finite has no votes; -1 where none is.
+    A motion that is not finite has no votes; -1 where none is.
     """
+    weight = matches.weight
     best, most = -1, -1.0
     everything = weight.sum()
     for h in range(len(T)):
         if not np.isfinite(T[h, 0, 0]):
             continue
         total, left = 0.0, everything
-        for i in range(len(x_r)):
+        for i in range(len(weight)):
             if total + left <= most:
                 break
             left -= weight[i]
-            misfit = _misfit(T[h], x_r, xy, depth, inv_px, inv_z, i, pinhole)
+            misfit = _misfit(T[h], matches, i, pinhole)
             if misfit < chi2:
                 total += weight[i] * (1.0 - misfit / chi2)
         if total > most:
             best, most = h, total
     if best >= 0:
-        for i in range(len(x_r)):
-            agrees[i] = _misfit(T[best], x_r, xy, depth, inv_px, inv_z, i, pinhole) < chi2
+        for i in range(len(weight)):
+            agrees[i] = _misfit(T[best], matches, i, pinhole) < chi2
     return best, most
 
 
 @kernel
-def _misfit(T, x_r, xy, depth, inv_px, inv_z, i, pinhole):
+def _misfit(T, matches, i, pinhole):
     """Squared distance in sigma between where a point should be seen and where it is."""
+    x_r, xy, depth, inv_px, inv_z, _ = matches
     x, y, z = x_r[i, 0], x_r[i, 1], x_r[i, 2]
     far = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
     if not far > Z_MIN:
@@ -74,15 +87,15 @@ def _area(xyz, normal, pinhole, j):
 
 
 @kernel
-def explain(
-    T: f8[:, ::1], xyz_r: f4[:, ::1], normal_r: f4[:, ::1], row: i4[:, ::1], xyz_i: f4[:, ::1], normal_i: f4[:, ::1],
-    pinhole: f8[::1], flatness: DepthNoise,
-):  # fmt: skip
+def explain(T: f8[:, ::1], reference: Points, frame: Points, view: View, flatness: DepthNoise):
     """Sum the surface [m^2] of the reference that the frame shows in the same place under T (4, 4), and what it looks through.
 
-    row (h, w) : the frame's point at each pixel of the pinhole camera, -1 = none; surfaces are the same up to `flatness`
+    view : of the frame; surfaces are the same up to `flatness`
     What agrees counts less the farther apart the two are. What is hidden from the frame counts for neither.
     """
+    xyz_r, normal_r, _ = reference
+    xyz_i, normal_i, _ = frame
+    row, pinhole = view
     height, width = row.shape
     explained, contradicted = 0.0, 0.0
     for j in range(len(xyz_r)):

@@ -119,7 +119,7 @@ class StepFinder:
         back = _explain(np.ascontiguousarray(se3.inverse(T)), common.target, common.source)
         explained, contradicted = (0.5 * (one + other) for one, other in zip(there, back, strict=True))
         agrees = np.zeros(len(common.weight), dtype=np.bool_)
-        _, matched = kernels.vote(T[None], *self._votes_of(common, np.arange(len(agrees))), CHI2_AGREE, agrees)
+        _, matched = kernels.vote(T[None], _votes(common, np.arange(len(agrees))), self._pinhole, CHI2_AGREE, agrees)
         surface = max(common.surface, 1e-9)
         return Judgement(T, (explained - contradicted + matched) / surface, explained / surface, contradicted / surface, agrees)
 
@@ -150,17 +150,12 @@ class StepFinder:
             drawn = np.searchsorted(bounds, bounds[-1] * self._rng.random((SAMPLES, 3))).clip(0, len(whole) - 1)
             T = np.ascontiguousarray(minimal_solvers.rigid3(common.x_r[whole[drawn]], common.x_i[whole[drawn]]))
             agrees = np.zeros(len(rows), dtype=np.bool_)
-            best, _ = kernels.vote(T, *self._votes_of(common, rows), CHI2_SAMPLE, agrees)
+            best, _ = kernels.vote(T, _votes(common, rows), self._pinhole, CHI2_SAMPLE, agrees)
             if best < 0 or agrees.sum() < LEAST // 2:
                 break
             found.append(self._refined_by_matches(np.vstack([T[best], [0.0, 0.0, 0.0, 1.0]]), common, rows[agrees]).T_cw)
             left[rows[agrees]] = False
         return found
-
-    def _votes_of(self, common: Common, rows: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Gather what the voting kernel takes of matches `rows`."""
-        m = common.measured.take(rows)
-        return common.x_r[rows], m.xy, m.depth, 1.0 / m.sigma_px, 1.0 / m.sigma_z, common.weight[rows], self._pinhole
 
     def _common(self, reference: int, i: int) -> Common:
         """Match two frames and gather what both measured."""
@@ -206,6 +201,12 @@ class StepFinder:
         return self._frame_points[frame]
 
 
+def _votes(common: Common, rows: np.ndarray) -> kernels.Matches:
+    """Return matches `rows` as the voting kernel takes them."""
+    m = common.measured.take(rows)
+    return kernels.Matches(common.x_r[rows], m.xy, m.depth, 1.0 / m.sigma_px, 1.0 / m.sigma_z, common.weight[rows])
+
+
 def _score(one: Judgement) -> float:
     return one.score
 
@@ -231,7 +232,7 @@ def swerve(T: np.ndarray, expected: np.ndarray) -> float:
 
 
 def _explain(T: np.ndarray, source: OrientedPoints, target: OrientedPoints) -> tuple[float, float]:
-    return kernels.explain(T, source.xyz, source.normal, target.row, target.xyz, target.normal, target.pinhole, FLATNESS)
+    return kernels.explain(T, source.points, target.points, target.view, FLATNESS)
 
 
 def _align(T: np.ndarray, source: OrientedPoints, target: OrientedPoints, prior: PosePrior) -> np.ndarray:

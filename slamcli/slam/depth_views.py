@@ -41,8 +41,8 @@ def seen_from(views: Views, frame: int, others: np.ndarray) -> tuple[np.ndarray,
     z = raw[place].astype(np.float32) * np.float32(icp.UNIT)  # -1 takes the 0 at the end
     T = np.ascontiguousarray(product(se3.inverse(views.T_wc[others]), views.T_wc[frame]))
     seen = np.zeros((len(others), *shape(views.camera)), dtype=np.uint8)
-    images = views.depth.of(others)
-    kernels.compare(z, kernels.smooth_places(z, SMOOTH), STEP, images, place, T, _pinhole(views.camera), TOLERANCE, icp.UNIT, seen)
+    looked_from = kernels.Others(views.depth.of(others), place, T, icp.UNIT)
+    kernels.compare(z, kernels.smooth_places(z, SMOOTH), STEP, looked_from, _pinhole(views.camera), TOLERANCE, seen)
     rows, columns = seen.shape[1:]
     return np.ascontiguousarray(z[STEP // 2 :: STEP, STEP // 2 :: STEP][:rows, :columns]), seen
 

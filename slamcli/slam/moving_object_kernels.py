@@ -1,5 +1,7 @@
 """Kernels of moving_objects.py: depth images compared under known poses, and groups and regions of places."""
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import b1, f4, f8, i4, i8, u1, u2
 
@@ -7,6 +9,15 @@ from slamcli.jit.kernel import kernel
 
 UNKNOWN, THROUGH, AGAIN, HIDDEN = range(4)  # what another view says of a place
 Z_MIN = 0.3  # [m] nearer than this a camera sees nothing
+
+
+class Others(NamedTuple):
+    """Other views, which are looked from."""
+
+    image: u2[:, :, ::1]  # (N, V, U) raw coarse depth images, times `unit` [m], 0 = none
+    place: i4[:, ::1]  # (V, U) where in them a place without distortion is, -1 = nowhere
+    T: f8[:, :, ::1]  # (N, 4, 4) from the camera whose view is looked at to theirs
+    unit: f8  # [m]
 
 
 @kernel
@@ -28,22 +39,21 @@ def smooth_places(z: f4[:, ::1], jump: f8):
 
 @kernel
 def compare(
-    z: f4[:, ::1], is_smooth: b1[:, ::1], step: i8, others: u2[:, :, ::1], place: i4[:, ::1], T: f8[:, :, ::1], pinhole: f8[::1],
-    tolerance: f8[::1], unit: f8, out: u1[:, :, ::1],
+    z: f4[:, ::1], is_smooth: b1[:, ::1], step: i8, others: Others, pinhole: f8[::1], tolerance: f8[::1], out: u1[:, :, ::1]
 ):  # fmt: skip
     """Look from other views at the places of one depth image (V, U) [m]; write THROUGH, AGAIN, HIDDEN or UNKNOWN.
 
     is_smooth : (V, U) places that may be compared, of which every `step`-th row and column is
-    others : (N, V, U) raw coarse images, times `unit` [m], 0 = none; place : (V, U) where in them a place without distortion is, -1 = nowhere
-    T : (N, 4, 4) from this camera to theirs; tolerance : base [m], share of the depth, growth with its square [1/m]
+    tolerance : base [m], share of the depth, growth with its square [1/m]
     out : (N, v, u)
 
     A view looks through a place when all it sees around there is farther.
     """
     fx, fy, cx, cy = pinhole
     rows, columns = z.shape
-    for k in range(len(others)):
-        other, t = others[k].ravel(), T[k]
+    image, place, T, unit = others
+    for k in range(len(image)):
+        other, t = image[k].ravel(), T[k]
         for v in range(out.shape[1]):
             for u in range(out.shape[2]):
                 row, column = v * step + step // 2, u * step + step // 2

@@ -19,26 +19,32 @@ NODE_RATIO = (
 Match = tuple[np.ndarray, np.ndarray]
 
 
-@kernel
-def _compare(
-    desc_i: u8[:, ::1],
-    block: i4[:, :, ::1],
-    desc_j: u8[:, ::1],
-    row_of_entry: i4[::1],
-    back: u4[::1],
-    best: i4[::1],
-    following: i4[::1],
-    choice: i4[::1],
-):
-    """Update each row's best and second-best match, and the best distance of each column.
+class Compared(NamedTuple):
+    """Which descriptors of frame j each of frame i is compared with."""
 
-    desc_i : (N, 4) uint64; block : (N, B, 2) int32, start and stop of the entries each row of i is compared with
-    desc_j : (4, E) uint64, entries, those of a node side by side; row_of_entry : (E,) int32, a row of j may have several
-    back : (E,) uint32, smallest distance << INDEX_BITS | row of i; best, following, choice : (N,) int32
+    block: i4[:, :, ::1]  # (N, B, 2) start and stop of the entries each row of i is compared with
+    entries: u8[:, ::1]  # (4, E) descriptors of j, those of a node side by side
+    row_of_entry: i4[::1]  # (E,) a row of j may have several
+
+
+class Nearest(NamedTuple):
+    """What comparing found, of N rows of i and of E entries."""
+
+    best: i4[::1]  # (N,) [bits] smallest distance
+    following: i4[::1]  # (N,) [bits] smallest distance to another row of j
+    choice: i4[::1]  # (N,) row of j, -1 = none
+    back: u4[::1]  # (E,) smallest distance << INDEX_BITS | row of i
+
+
+@kernel
+def _compare(desc_i: u8[:, ::1], compared: Compared, nearest: Nearest):
+    """Find each row's best and second-best match, and the best distance of each column; desc_i (N, 4).
 
     A distance and an index in one number have their minimum at the smallest distance, of equals the first; so no loop has a branch, and several
     descriptors go in one instruction.
     """
+    block, desc_j, row_of_entry = compared
+    best, following, choice, back = nearest
     b0, b1, b2, b3 = desc_j[0], desc_j[1], desc_j[2], desc_j[3]
     distance = np.empty(len(row_of_entry), dtype=np.uint32)
     shift = uint32(INDEX_BITS)
@@ -54,29 +60,20 @@ def _compare(
         if least == uint32(0xFFFFFFFF):
             best[i], following[i], choice[i] = FAR, FAR, -1
             continue
-        nearest, second = row_of_entry[least & uint32((1 << INDEX_BITS) - 1)], uint32(FAR)
+        row, second = row_of_entry[least & uint32((1 << INDEX_BITS) - 1)], uint32(FAR)
         for b in range(block.shape[1]):
             for e in range(uintp(block[i, b, 0]), uintp(block[i, b, 1])):
-                second = min(second, distance[e] if row_of_entry[e] != nearest else uint32(FAR))
-        best[i], following[i], choice[i] = least >> shift, second, nearest
+                second = min(second, distance[e] if row_of_entry[e] != row else uint32(FAR))
+        best[i], following[i], choice[i] = least >> shift, second, row
 
 
 @kernel
-def _accept(
-    best: i4[::1],
-    following: i4[::1],
-    choice: i4[::1],
-    back: u4[::1],
-    row_of_entry: i4[::1],
-    back_of_row: u4[::1],
-    max_distance: i8,
-    ratio: f8,
-    rows: i4[:, ::1],
-):
+def _accept(nearest: Nearest, row_of_entry: i4[::1], back_of_row: u4[::1], max_distance: i8, ratio: f8, rows: i4[:, ::1]):
     """List the matches that pass distance and ratio and are each other's nearest.
 
     back_of_row : (M,) uint32 of the largest number, becomes `back` of the rows of j; rows : (N, 2) int32. Returns the number of matches.
     """
+    best, following, choice, back = nearest
     for e in range(len(back)):
         j = row_of_entry[e]
         back_of_row[j] = min(back_of_row[j], back[e])
@@ -166,14 +163,6 @@ def match_nodes(i: Described, j: Described, *, max_distance: int = 64, ratio: fl
     return _match(i, j, Compared(block, entries, row_of_entry[:n]), max_distance, ratio * NODE_RATIO, check_rotation)
 
 
-class Compared(NamedTuple):
-    """Which descriptors of frame j each of frame i is compared with."""
-
-    block: np.ndarray  # (N, B, 2) int32, start and stop of entries
-    entries: np.ndarray  # (4, E) uint64, descriptors of j
-    row_of_entry: np.ndarray  # (E,) int32
-
-
 def _two_nodes(features: Described) -> np.ndarray:
     """Return nodes (N, 2) int32; -1 stands for no second."""
     if features.node is None or len(features.node) != len(features.desc):
@@ -216,7 +205,7 @@ def _keep_agreeing(rows: i4[:, ::1], angle_i: f4[::1], angle_j: f4[::1]):
 
 
 def _match(i: Described, j: Described, compared: Compared, max_distance: int, ratio: float, check_rotation: bool) -> Match:
-    block, entries, row_of_entry = compared
+    row_of_entry = compared.row_of_entry
     words_i, n_i, n_j = as_words(i.desc), len(i.angle), len(j.angle)
     if len(words_i) != n_i or row_of_entry.max(initial=-1) >= n_j:
         raise ValueError("each descriptor needs an angle")
@@ -224,9 +213,10 @@ def _match(i: Described, j: Described, compared: Compared, max_distance: int, ra
         raise ValueError(f"more than {1 << INDEX_BITS} descriptors in a frame")
     best, following, choice = (np.empty(n_i, dtype=np.int32) for _ in range(3))
     back, back_of_row = (np.full(n, 0xFFFFFFFF, dtype=np.uint32) for n in (len(row_of_entry), n_j))
-    _compare(words_i, block, entries, row_of_entry, back, best, following, choice)
+    nearest = Nearest(best, following, choice, back)
+    _compare(words_i, compared, nearest)
     rows = np.empty((n_i, 2), dtype=np.int32)
-    rows = rows[: _accept(best, following, choice, back, row_of_entry, back_of_row, min(int(max_distance), FAR - 1), float(ratio), rows)]
+    rows = rows[: _accept(nearest, row_of_entry, back_of_row, min(int(max_distance), FAR - 1), float(ratio), rows)]
     if check_rotation:
         rows = rows[
             : _keep_agreeing(rows, np.ascontiguousarray(i.angle, dtype=np.float32), np.ascontiguousarray(j.angle, dtype=np.float32))

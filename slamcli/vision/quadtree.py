@@ -1,5 +1,7 @@
 """The quadtree that spreads key points over each level of a pyramid; [Z] 1.1, steps 4 to 7."""
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import f4, i4, i8, u1
 
@@ -10,27 +12,34 @@ NODE_COLUMNS = 6
 NONE = -1  # there is no further point
 
 
+class _Trees(NamedTuple):
+    """The leaves of the quadtrees of all levels, and the points in each."""
+
+    node: i4[
+        :, ::1
+    ]  # (sum of wanted + 3 for each level, NODE_COLUMNS); a level's begin where those of the levels before would all find room
+    n_nodes: i8[::1]  # (levels,)
+    following: i4[::1]  # (N,) the next point in the same node
+
+
+class _Room(NamedTuple):
+    """Room to work in."""
+
+    child: i4[:, ::1]  # (4, 2)
+    rank: i4[::1]  # (rows of `node`,)
+
+
 @kernel
-def _grow(
-    xy: i4[:, ::1],
-    first: i8[::1],
-    root: i4[:, ::1],
-    wanted: i8[::1],
-    node: i4[:, ::1],
-    n_nodes: i8[::1],
-    following: i4[::1],
-    child: i4[:, ::1],
-    rank: i4[::1],
-):
+def _grow(xy: i4[:, ::1], first: i8[::1], root: i4[:, ::1], wanted: i8[::1], trees: _Trees, room: _Room):
     """Split the nodes of each level until there are as many as wanted or nothing can split; a split may give up to three too many.
 
-    xy : (N, 2) int32 [px]; following : (N,) int32, the next point in the same node
-    node : (sum of wanted + 3 for each level, NODE_COLUMNS) int32, and n_nodes : (levels,) int64, filled; a level's nodes begin where those
-    of the levels before it would all find room; child : (4, 2) int32 and rank : (rows of node,) int32, scratch
+    xy : (N, 2) int32 [px]; first, root, wanted : as of `choose`; trees : to be filled
 
     Rounds: every node with more than one point splits in four, the fullest first, of equals the one with the lower row. The first child
     that has points takes its parent's row, the others are appended. One kernel, without calls: each would be compiled and optimized again.
     """
+    node, n_nodes, following = trees
+    child, rank = room
     base = 0
     for level in range(len(wanted)):
         start, end, n = first[level], first[level + 1], base
@@ -80,18 +89,12 @@ def _grow(
 
 
 @kernel
-def _strongest(
-    response: f4[::1],
-    wanted: i8[::1],
-    node: i4[:, ::1],
-    n_nodes: i8[::1],
-    following: i4[::1],
-    is_chosen: u1[::1],
-):
+def _strongest(response: f4[::1], wanted: i8[::1], trees: _Trees, is_chosen: u1[::1]):
     """Choose the strongest point of each leaf, of equals the first; where the last split gave leaves too many, the weakest go.
 
     response : (N,) float32; is_chosen : (N,) uint8, 0, becomes 1
     """
+    node, n_nodes, following = trees
     base = 0
     for level in range(len(wanted)):
         for v in range(base, base + n_nodes[level]):
@@ -121,10 +124,10 @@ def choose(xy: np.ndarray, response: np.ndarray, first: np.ndarray, root: np.nda
     root : (levels, 4) int32, x0, y0, x1, y1 of the first nodes [px], the end excluded
     Returns increasing rows (M,) int64 of xy and their levels (M,) uint8. Where the last split gave nodes too many, the weakest points go.
     """
-    goal, room = np.array(wanted, dtype=np.int64), sum(wanted) + 3 * len(wanted)
-    node, n_nodes, following = np.empty((room, NODE_COLUMNS), np.int32), np.empty(len(wanted), np.int64), np.empty(len(xy), np.int32)
-    _grow(xy, first, root, goal, node, n_nodes, following, np.empty((4, 2), np.int32), np.empty(room, np.int32))
+    goal, most = np.array(wanted, dtype=np.int64), sum(wanted) + 3 * len(wanted)
+    trees = _Trees(np.empty((most, NODE_COLUMNS), np.int32), np.empty(len(wanted), np.int64), np.empty(len(xy), np.int32))
+    _grow(xy, first, root, goal, trees, _Room(np.empty((4, 2), np.int32), np.empty(most, np.int32)))
     is_chosen = np.zeros(len(xy), np.uint8)
-    _strongest(response, goal, node, n_nodes, following, is_chosen)
+    _strongest(response, goal, trees, is_chosen)
     rows = np.flatnonzero(is_chosen)
     return rows, (np.searchsorted(first, rows, side="right") - 1).astype(np.uint8)

@@ -138,7 +138,7 @@ def test_the_same_frames_again_change_neither_the_number_of_points_nor_the_point
     rows = []
     for _ in range(5):
         often.add(see(depth), rgb, np.eye(4))
-        rows.append(len(often._rows.row_key))
+        rows.append(len(often._rows.index.row_key))
     np.testing.assert_allclose(once.cloud().xyz, often.cloud().xyz, atol=1e-5)
     assert rows[4] == rows[1]
     assert len(once.cloud(min_points=5)) < len(often.cloud(min_points=5)) == len(once.cloud())

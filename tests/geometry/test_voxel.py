@@ -32,11 +32,11 @@ def test_rows_are_those_of_a_dictionary(keys: list[int], absent: int) -> None:
     rows, expected = voxel.VoxelRows(), {}
     rows.reserve(len(keys))
     for key in keys:
-        row = voxel.find_or_add(rows.slot_row, rows.row_key, rows.n, key)
+        row = voxel.find_or_add(rows.index, rows.n, key)
         assert row == expected.setdefault(key, len(expected))
         rows.n = max(rows.n, row + 1)
-    assert rows.row_key[: rows.n].tolist() == list(expected)
-    assert voxel.find_row(rows.slot_row, rows.row_key, absent) == expected.get(absent, -1)
+    assert rows.key.tolist() == list(expected)
+    assert voxel.find_row(rows.index, absent) == expected.get(absent, -1)
 
 
 def test_rows_keep_their_numbers_and_columns_while_the_table_grows() -> None:
@@ -46,12 +46,12 @@ def test_rows_keep_their_numbers_and_columns_while_the_table_grows() -> None:
         rows.reserve(500)
         for key in keys[start : start + 500]:
             rows.columns["value"][rows.n] = rows.n
-            rows.n += voxel.find_or_add(rows.slot_row, rows.row_key, rows.n, key) == rows.n
-    found = [voxel.find_row(rows.slot_row, rows.row_key, key) for key in keys]
+            rows.n += voxel.find_or_add(rows.index, rows.n, key) == rows.n
+    found = [voxel.find_row(rows.index, key) for key in keys]
     assert found == list(range(len(keys)))
     assert (rows.columns["value"][: rows.n, 0] == np.arange(rows.n)).all()
     assert np.isnan(rows.columns["value"][rows.n :]).all()
-    assert len(rows.slot_row) >= 2 * len(rows.row_key)
+    assert len(rows.index.slot_row) >= 2 * len(rows.index.row_key)
 
 
 def test_a_map_beyond_all_memory_is_refused() -> None:

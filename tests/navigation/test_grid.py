@@ -144,8 +144,9 @@ def test_band_points_floor_holes_and_tops_match_their_slow_twin():
         T[2, 3] += lift
         sight, noise = Sight(corner, cell=0.05, near=0.5, far=4.0, low=0.05, high=0.5, drop=0.08), READING
         seen, ground = grid_evidence.blank_cells(side), rolling(side) if height == 0.6 else np.zeros((side, side), np.float32)
-        grid_evidence._sort_points(depth, KINECT.rays, T, sight, noise, 3, 4, ground, seen)
-        expected = naive.sorted_points(depth, KINECT.rays, T, corner, 3, 4, ground, *sight[1:], *noise, side)
+        image = grid_evidence.DepthImage(depth, KINECT.rays, T)
+        grid_evidence._sort_points(image, sight, noise, 3, 4, ground, seen)
+        expected = naive.sorted_points(image, sight, noise, 3, 4, ground, side)
         assert seen.n_band.sum() > 100 and (seen.floor.sum() > 100 if lift == 0.0 else min(seen.hole.sum(), seen.top.sum()) > 50)
         for found, twin in zip((*seen[:4], seen.top > 0), expected, strict=True):
             np.testing.assert_array_equal(found, twin)
@@ -158,9 +159,10 @@ def test_crossed_slices_match_their_slow_twin():
     sight, noise = Sight(corner, cell=0.05, near=0.5, far=4.0, low=0.05, high=0.5, drop=0.08), READING
     crossed = np.zeros((side, side), np.uint16)
     ground = rolling(side)
-    grid_evidence._cross(depth, KINECT.rays, T, sight, noise, 5, ground, crossed)
+    image = grid_evidence.DepthImage(depth, KINECT.rays, T)
+    grid_evidence._cross(image, sight, noise, 5, ground, crossed)
     expected = np.zeros((side, side), np.uint16)
-    for i, j, k in naive.crossed_slices(depth, KINECT.rays, T, corner, 5, ground, *sight[1:-1], *noise, side):
+    for i, j, k in naive.crossed_slices(image, sight, noise, 5, ground, side):
         expected[i, j] |= np.uint16(1 << k)
     assert (crossed > 0).sum() > 300
     np.testing.assert_array_equal(crossed, expected)
@@ -178,13 +180,9 @@ def test_lines_of_sight_match_their_slow_twin():
         ground = np.ascontiguousarray(ground)
         got, hangs = np.arange(len(rows)) % 7 > 0, np.zeros((40, 50), np.uint16)
         was_hidden = ~got
-        grid._drop_hidden(got, standing, is_open, hangs, face, around, ground, grid.CellSights(rows, columns, *camera, 0.05, 0.5, 20.0))
-        expected = np.array(
-            [
-                naive.is_clear(standing, is_open, face, around, ground, r, c, *camera, 0.05, 0.5, 20.0)
-                for r, c in zip(rows, columns, strict=True)
-            ]
-        )
+        sight = grid.CellSights(rows, columns, *camera, 0.05, 0.5, 20.0)
+        grid._drop_hidden(got, standing, is_open, hangs, face, around, ground, sight)
+        expected = np.array([naive.is_clear(standing, is_open, face, around, ground, n, sight) for n in range(len(rows))])
         np.testing.assert_array_equal(got, expected & ~was_hidden)
         assert 0.15 < np.mean(~got) < 0.98
         assert (hangs > 0).any() and not (hangs & ~standing).any()

@@ -176,7 +176,7 @@ def test_gathered_levels_match_their_slow_twin():
     depth = kinect_noise(render(T), np.random.default_rng(3))
     sight = grid_evidence.Sight(np.zeros(2), cell=0.05, near=0.5, far=4.0, low=0.05, high=0.5, drop=0.08)
     cell, height = np.zeros((5000, 2), np.int32), np.zeros(5000)
-    n = grid_evidence._gather_levels(depth, KINECT.rays, T, sight, 3, 4, cell, height)
+    n = grid_evidence._gather_levels(grid_evidence.DepthImage(depth, KINECT.rays, T), sight, 3, 4, cell, height)
     expected = []
     for v in range(1, 120, 3):
         for u in range(1, 160, 3):

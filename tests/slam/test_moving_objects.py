@@ -203,9 +203,7 @@ def test_the_room_speaks_for_its_own_motion_by_its_extent() -> None:
     true, followed = se3.inverse(views.T_wc[16]) @ views.T_wc[10], np.eye(4)
 
     def explain(T: np.ndarray) -> tuple[float, float]:
-        return background_motion_kernels.explain(
-            np.ascontiguousarray(T), source.xyz, source.normal, target.row, target.xyz, target.normal, target.pinhole, FLATNESS
-        )
+        return background_motion_kernels.explain(np.ascontiguousarray(T), source.points, target.points, target.view, FLATNESS)
 
     surface = background_motion_kernels.surface(source.xyz, source.normal, source.pinhole)
     (right, against_right), (wrong, against_wrong) = explain(true), explain(followed)
@@ -223,9 +221,8 @@ def test_votes_are_counted_as_by_hand() -> None:
     depth, weight = moved[:, 2] + rng.normal(0, 0.01, 60), rng.uniform(0.5, 2.0, 60)
     depth[::7] = np.nan
     agrees = np.zeros(60, dtype=np.bool_)
-    best, total = background_motion_kernels.vote(
-        T, x, np.ascontiguousarray(xy), depth, np.full(60, 1.0), np.full(60, 50.0), weight, pinhole, 9.0, agrees
-    )
+    matches = background_motion_kernels.Matches(x, np.ascontiguousarray(xy), depth, np.full(60, 1.0), np.full(60, 50.0), weight)
+    best, total = background_motion_kernels.vote(T, matches, pinhole, 9.0, agrees)
     expected, shares = [], []
     for pose in T:
         y = se3.transform(pose, x)
@@ -264,14 +261,13 @@ def test_a_region_stops_where_depth_jumps() -> None:
 @pytest.mark.parametrize(("seen", "said"), [(1.0, "AGAIN"), (1.6, "THROUGH"), (0.6, "HIDDEN"), (0.0, "UNKNOWN"), (1.05, "AGAIN")])
 def test_what_another_view_says_of_a_wall(seen: float, said: str) -> None:
     z = np.ones((12, 16), np.float32)
-    others = np.full((1, 12, 16), round(seen / icp.UNIT), np.uint16)
+    images = np.full((1, 12, 16), round(seen / icp.UNIT), np.uint16)
     place = np.arange(12 * 16, dtype=np.int32).reshape(12, 16)
     out = np.zeros((1, 6, 8), np.uint8)
     smooth = moving_object_kernels.smooth_places(z, 0.06)
     assert smooth[1:-1, 1:-1].all() and not smooth[0].any()
-    moving_object_kernels.compare(
-        z, smooth, 2, others, place, np.eye(4)[None], np.array([15.0, 15.0, 7.5, 5.5]), np.array([0.06, 0.02, 0.008]), icp.UNIT, out
-    )
+    others = moving_object_kernels.Others(images, place, np.eye(4)[None], icp.UNIT)
+    moving_object_kernels.compare(z, smooth, 2, others, np.array([15.0, 15.0, 7.5, 5.5]), np.array([0.06, 0.02, 0.008]), out)
     assert set(np.unique(out[0, :-1, :-1])) == {getattr(moving_object_kernels, said)}
 
 
