@@ -32,7 +32,7 @@ from slamcli.navigation import planner
 from slamcli.runs.placement import camera_path
 from slamcli.runs.run_directory import RunDir
 from slamcli.schema import Features, Grid, Ground, Map, Tracks, frame_poses
-from slamcli.visualization.grid_picture import draw
+from slamcli.visualization.grid_picture import Overlay, draw
 
 PAPER = {"speed": 0.15, "turn_rate": 0.15, "laps": 1.03, "field_of_view": 57.0, "depth_min": 1.2, "depth_max": 3.5, "frames": None}
 SENSOR = ("sensor.depth_min=1.2", "sensor.depth_max=3.5", "grid2d.min_range=1.2", "grid2d.max_range=3.5")
@@ -211,12 +211,12 @@ def draw_all(folder: Path, lab: Lab, plans: list[dict]) -> None:
     axis.set(xlabel="x [m]", ylabel="y [m]")
     axis.set_title("the same along the floor's normal")
     for k, (name, grid) in enumerate((("from the camera", lab.grid), (f"from a laser at {LASER_HEIGHT:g} m", lab.laser))):
-        draw(figures["fig9_grids"].add_subplot(1, 2, k + 1), grid, trajectory=trajectory, title=name)
+        draw(figures["fig9_grids"].add_subplot(1, 2, k + 1), grid, Overlay(trajectory), title=name)
     for plan in plans:
         figures[f"fig10_{plan['box']}"] = figure = Figure(figsize=(16, 8))
         for k, (name, grid) in enumerate((("ours", lab.grid), ("laser", lab.laser))):
             title = f"{name}: touches {', '.join(plan[name]) or 'nothing'}"
-            draw(figure.add_subplot(1, 2, k + 1), grid, route=plan["routes"][name].xy, radius=RADIUS, title=title)
+            draw(figure.add_subplot(1, 2, k + 1), grid, Overlay(route=plan["routes"][name].xy, radius=RADIUS), title=title)
     for name, figure in figures.items():
         FigureCanvasAgg(figure)
         figure.savefig(folder / f"{name}.png", dpi=110, bbox_inches="tight")

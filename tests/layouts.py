@@ -329,7 +329,7 @@ def ros1(content: Content, out: Path, **how: object) -> Path:
     if how.pop("packed", False):
         writer.set_compression(Writer.CompressionFormat.LZ4)
     with writer:
-        write_ros(writer, content, is_cdr=False, **how)
+        write_ros(writer, content, RosMessages(**how), is_cdr=False)
     return out / "walk.bag"
 
 
@@ -342,7 +342,7 @@ def ros2(content: Content, out: Path, *, storage: str = "sqlite3", packed: str =
     if packed:
         writer.set_compression(CompressionMode[packed.upper()], CompressionFormat.ZSTD)
     with writer:
-        write_ros(writer, content, is_cdr=True, **how)
+        write_ros(writer, content, RosMessages(**how), is_cdr=True)
     return out
 
 
@@ -354,22 +354,24 @@ def mcap(content: Content, out: Path, **how: object) -> Path:
     return out / "walk.mcap"
 
 
-def write_ros(
-    writer: object,
-    content: Content,
-    *,
-    is_cdr: bool,
-    colour: str = "jpeg",
-    depth: str = "32FC1",
-    depth_frame: str = "color_optical",
-    depth_topic: str = "/camera/depth_registered/image_raw",
-    depth_camera: dict[str, float] | None = None,
-    T_cd: np.ndarray | None = None,
-    infrared: bool = False,
-    shuffled: bool = False,
-    skip: tuple[str, ...] = (),
-) -> None:
+@dataclass(frozen=True)
+class RosMessages:
+    """Which messages a bag holds, and how."""
+
+    colour: str = "jpeg"
+    depth: str = "32FC1"
+    depth_frame: str = "color_optical"
+    depth_topic: str = "/camera/depth_registered/image_raw"
+    depth_camera: dict[str, float] | None = None
+    T_cd: np.ndarray | None = None
+    infrared: bool = False
+    shuffled: bool = False
+    skip: tuple[str, ...] = ()
+
+
+def write_ros(writer: object, content: Content, how: RosMessages, *, is_cdr: bool) -> None:
     """Write colour, depth, CameraInfo and tf by the definitions that rosbags ships: not by the reader's own parser."""
+    depth, depth_frame, depth_topic = how.depth, how.depth_frame, how.depth_topic
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     store = get_typestore(Stores.ROS2_HUMBLE if is_cdr else Stores.ROS1_NOETIC)
@@ -428,34 +430,36 @@ def write_ros(
 
     def colour_message(i: int) -> tuple[str, str, object]:
         stamp, name = content.stamp[i], "/camera/color/image_raw"
-        if colour == "jpeg":
+        if how.colour == "jpeg":
             kind = "rgb8; jpeg compressed bgr8" if content.suffix == ".jpg" else "rgb8; png compressed bgr8"
             return f"{name}/compressed", SENSOR_COMPRESSED, compressed(content.colour[i], kind, stamp, "color_optical")
-        image = content.bgr(i) if colour == "bgr8" else cv2.cvtColor(content.bgr(i), cv2.COLOR_BGR2RGB)
-        return name, SENSOR_IMAGE, raw(image, colour, stamp, "color_optical")
+        image = content.bgr(i) if how.colour == "bgr8" else cv2.cvtColor(content.bgr(i), cv2.COLOR_BGR2RGB)
+        return name, SENSOR_IMAGE, raw(image, how.colour, stamp, "color_optical")
 
     messages: list[tuple[int, str, str, object]] = []
     depth_space = depth_topic.rsplit("/", 1)[0]
     for i in range(len(content.stamp)):
         at = max(content.stamp[i], content.depth_stamp[i]) + 5_000_000
-        if "colour" not in skip:
+        if "colour" not in how.skip:
             messages.append((at, *colour_message(i)))
-        if "depth" not in skip:
+        if "depth" not in how.skip:
             messages.append((at + 1, *depth_message(i)))
-        if infrared:
+        if how.infrared:
             grey = cv2.cvtColor(content.bgr(i), cv2.COLOR_BGR2GRAY)
             messages.append((at + 2, "/camera/infra1/image_raw", SENSOR_IMAGE, raw(grey, "mono8", content.stamp[i], "infra")))
             unregistered = raw(content.raw[i] // 2, "16UC1", content.depth_stamp[i], "depth_optical")
             messages.append((at + 3, "/camera/depth/image_rect_raw", SENSOR_IMAGE, unregistered))
-        if "info" not in skip:
+        if "info" not in how.skip:
             kind = "sensor_msgs/msg/CameraInfo"
             messages.append((at, "/camera/color/camera_info", kind, info(content.camera, content.stamp[i], "color_optical")))
-            messages.append((at, f"{depth_space}/camera_info", kind, info(depth_camera or content.camera, content.stamp[i], depth_frame)))
-    if T_cd is not None:
+            messages.append(
+                (at, f"{depth_space}/camera_info", kind, info(how.depth_camera or content.camera, content.stamp[i], depth_frame))
+            )
+    if how.T_cd is not None:
         messages.insert(
-            0, (content.stamp[0], "/tf_static", "tf2_msgs/msg/TFMessage", _tf(types, header, T_cd, content.stamp[0], depth_frame))
+            0, (content.stamp[0], "/tf_static", "tf2_msgs/msg/TFMessage", _tf(types, header, how.T_cd, content.stamp[0], depth_frame))
         )
-    if shuffled:
+    if how.shuffled:
         messages = messages[::-1]
     connections: dict[str, object] = {}
     for at, topic, kind, message in messages:

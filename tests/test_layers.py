@@ -1,4 +1,4 @@
-"""The rules of import, and of what a compiled kernel may call. Read from the source text: nothing is imported for it."""
+"""The rules of import, of what a compiled kernel may call, and of arguments. Read from the source text: nothing is imported for it."""
 
 import ast
 import re
@@ -198,6 +198,30 @@ def test_what_a_run_writes_does_not_follow_the_processor(path: Path) -> None:
     products = [ast.unparse(node) for node in ast.walk(tree) if isinstance(node, ast.BinOp) and isinstance(node.op, ast.MatMult)]
     known = SPARSE.get(name_of(path), [])
     assert not [text for text in products if not any(text in allowed for allowed in known)]
+
+
+# What belongs together travels together: as a record, whose fields say what each thing is.
+MOST_PARAMETERS = 8
+CHOSEN_BY_NAME = ("api.py: run",)  # its keywords are the options of `slamcli run`, each with a default
+
+
+def parameters(function: ast.FunctionDef) -> list[str]:
+    every = function.args.posonlyargs + function.args.args + function.args.kwonlyargs
+    packed = [one for one in (function.args.vararg, function.args.kwarg) if one is not None]
+    return [one.arg for one in every + packed if one.arg not in ("self", "cls")]
+
+
+def is_command(function: ast.FunctionDef) -> bool:
+    """Its arguments are the options of the command line."""
+    return any(re.match(r"\w+\.command|click\.(command|option|argument)", ast.unparse(one)) for one in function.decorator_list)
+
+
+@pytest.mark.parametrize("path", MODULES, ids=name_of)
+def test_no_function_takes_a_long_list_of_arguments(path: Path) -> None:
+    for function in (node for node in ast.walk(parsed(path)) if isinstance(node, ast.FunctionDef) and not is_command(node)):
+        if f"{name_of(path)}: {function.name}" not in CHOSEN_BY_NAME:
+            found = parameters(function)
+            assert len(found) <= MOST_PARAMETERS, f"{name_of(path)}:{function.lineno}: {function.name} takes {len(found)}: {found}"
 
 
 def test_help_is_instant_since_it_imports_nothing_heavy() -> None:

@@ -70,9 +70,9 @@ def export_grid(
     written: tuple[Path, ...] = grid_map.write(out, page, start=start)
     if png is not None:
         from slamcli.runs.placement import camera_path
-        from slamcli.visualization.grid_picture import save_picture
+        from slamcli.visualization.grid_picture import Overlay, save_picture
 
-        save_picture(png, grid, trajectory=camera_path(folder), title=str(folder.info()["dataset"]))
+        save_picture(png, grid, Overlay(camera_path(folder)), title=str(folder.info()["dataset"]))
         written = (*written, png)
     write_costs = partial(cost_map.write, origin=page.origin, resolution=page.resolution)
     if costs is not None:

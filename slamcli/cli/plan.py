@@ -87,7 +87,7 @@ def plan(
     from slamcli.navigation import planner
     from slamcli.runs.placement import camera_path
     from slamcli.schema import Grid
-    from slamcli.visualization.grid_picture import save_picture
+    from slamcli.visualization.grid_picture import Overlay, save_picture
 
     trajectory = None
     if page is None:
@@ -121,7 +121,7 @@ def plan(
     if out is not None:
         _write(out, texts)
     if png is not None:
-        save_picture(png, grid, trajectory=trajectory, route=route.xy, radius=radius, title=f"{title}: path of {route.length:.2f} m")
+        save_picture(png, grid, Overlay(trajectory, route.xy, radius), title=f"{title}: path of {route.length:.2f} m")
     click.echo(texts[".json" if as_json else ".csv"], nl=False)
     least = f"{float(route.clearance.min()) + radius:.2f} m"
     picture = f"; drawn in {png}" if png else ""
@@ -184,11 +184,11 @@ def _tell_reachable(
 ) -> None:
     """Print the area that a robot can get to from `start` and the rooms that it cannot, and draw what of the free floor it cannot."""
     from slamcli.navigation.reach import reach
-    from slamcli.visualization.grid_picture import save_picture
+    from slamcli.visualization.grid_picture import Overlay, save_picture
 
     found = reach(grid, start, radius=radius, allow_unknown=allow_unknown, walls=walls)
     if png is not None:
-        save_picture(png, grid, reached=found.cells, ends=[start], title=f"white: within reach of a robot of {radius:g} m radius")
+        save_picture(png, grid, Overlay(reached=found.cells, ends=[start]), title=f"white: within reach of a robot of {radius:g} m radius")
     if as_json:
         click.echo(json.dumps({"start": _rounded(start), "radius": radius, **found.to_dict()}))
         return
@@ -206,12 +206,12 @@ def _draw_reach(
 ) -> None:
     """Draw what a robot can cover from the first of two places between which there is no way."""
     from slamcli.navigation import cost_layers
-    from slamcli.visualization.grid_picture import save_picture
+    from slamcli.visualization.grid_picture import Overlay, save_picture
 
     centres = cost_layers.reachable(grid, ends[0], radius=radius, allow_unknown=allow_unknown)
     reached = cost_layers.swept(grid, centres, radius=radius)
     title = f"no way for a robot of {radius:g} m radius; white: within reach"
-    save_picture(png, grid, trajectory=trajectory, reached=reached, ends=ends, title=title)
+    save_picture(png, grid, Overlay(trajectory, reached=reached, ends=ends), title=title)
 
 
 def _ends(

@@ -10,10 +10,11 @@ import numpy as np
 
 from slamcli.datasets.lists import read_text
 from slamcli.datasets.simulated import building, drive, moved_things, noise, people, room
-from slamcli.datasets.simulated.drive import Motion
+from slamcli.datasets.simulated.drive import Motion, Pace
 from slamcli.datasets.simulated.figures import Figure
 from slamcli.datasets.simulated.moved_things import Moved
 from slamcli.datasets.simulated.noise import SensorNoise
+from slamcli.datasets.simulated.room import Furnishing
 from slamcli.datasets.simulated.scene import Patch, Scene, with_textured_share
 from slamcli.datasets.staging import staged
 from slamcli.errors import SlamError
@@ -167,17 +168,18 @@ def build(what: Simulation) -> tuple[Scene, Motion]:
     if what.alias == "corridor":
         return room.corridor(low, high, seed=what.seed, twin=what.twin), motion
     centres = np.column_stack([path, np.zeros(len(path))])  # the robot itself is on the floor
-    return room.furnished_room(
-        low, high, centres, seed=what.seed, twin=what.twin, twins=what.alias == "posters", movable=what.movable, empty=what.empty,
-        moved_chair=what.moved_chair,
-    ), motion  # fmt: skip
+    return room.furnished_room(low, high, centres, seed=what.seed, furnishing=_furnishing(what)), motion
+
+
+def _furnishing(what: Simulation) -> Furnishing:
+    return Furnishing(what.twin, what.alias == "posters", what.movable, what.empty, what.moved_chair)
 
 
 def _drive(what: Simulation, path: np.ndarray, rng: np.random.Generator, **more: float) -> Motion:
     """Drive along a closed path (N, 2) as it is asked for; more : arguments of `drive.rounds`."""
     path = drive.turned(path, start=what.start, backwards=what.backwards)
-    return drive.rounds(path, frames=what.frames, speed=what.speed, turn_rate=what.turn_rate, rate=what.rate, laps=what.laps,
-                        height=what.camera_height, pitch=np.radians(what.pitch), rng=rng, rest=what.rest, **more)  # fmt: skip
+    pace = Pace(what.frames, what.speed, what.turn_rate, what.rate, what.laps, what.rest)
+    return drive.rounds(path, pace, height=what.camera_height, pitch=np.radians(what.pitch), rng=rng, **more)
 
 
 def _around_trajectory(what: Simulation, trajectory: Path) -> tuple[Scene, Motion]:
@@ -195,10 +197,7 @@ def _around_trajectory(what: Simulation, trajectory: Path) -> tuple[Scene, Motio
         lacking = max(0.0, least - (high[axis] - low[axis])) / 2
         low[axis], high[axis] = low[axis] - lacking, high[axis] + lacking
     low[2], high[2] = 0.0, max(room.HEIGHT, float(centres[:, 2].max()) + 0.5)
-    return room.furnished_room(
-        low, high, centres, seed=what.seed, twins=what.alias == "posters", movable=what.movable, empty=what.empty,
-        moved_chair=what.moved_chair,
-    ), motion  # fmt: skip
+    return room.furnished_room(low, high, centres, seed=what.seed, furnishing=_furnishing(what)), motion
 
 
 def read_stamps(path: Path) -> np.ndarray:

@@ -97,15 +97,8 @@ def _grid(run: RunDir, title: str, path: np.ndarray) -> Picture:
     size = np.array([columns, rows]) / max(rows, columns) * LONGEST_GRID
     figure = Figure(figsize=tuple(np.maximum(size, 3.5) + [0.8, 1.4]))
     FigureCanvasAgg(figure)
-    grid_picture.draw(
-        figure.add_subplot(),
-        grid,
-        trajectory=path,
-        route=None if route is None else route.xy,
-        radius=ROBOT_RADIUS,
-        start=placement.read(run).first,
-        font=GRID_FONT,
-    )
+    over = grid_picture.Overlay(path, None if route is None else route.xy, ROBOT_RADIUS, began=placement.read(run).first)
+    grid_picture.draw(figure.add_subplot(), grid, over, font=GRID_FONT)
     buffer = io.BytesIO()
     figure.savefig(buffer, dpi=GRID_DPI, bbox_inches="tight")
     planned = f"; an example path of {route.length:.1f} m for a robot of {ROBOT_RADIUS:g} m radius" if route is not None else ""

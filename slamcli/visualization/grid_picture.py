@@ -1,6 +1,7 @@
 """Pictures of the grid for people: with trajectory, path, scale bar and legend."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,15 +18,20 @@ LONGEST_SIDE = 11.0  # inches
 BAR_LENGTHS = np.array([0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0])  # [m]
 
 
-def save_picture(path: Path, grid: Grid, *, trajectory: np.ndarray | None = None, route: np.ndarray | None = None, radius: float = 0.0,
-                 title: str = "", reached: np.ndarray | None = None, ends: Sequence[Sequence[float]] = ()) -> None:  # fmt: skip
-    """Draw a grid.
+@dataclass(frozen=True)
+class Overlay:
+    """What is drawn upon a grid, in the level frame."""
 
-    trajectory : (N, 2 or more) [m, level frame] camera centres; a row of NaN interrupts the line
-    route : (M, 2) [m] planned path, drawn as wide as a robot of `radius` [m]
-    reached : (H, W) bool, cells that a robot can cover; free floor beyond them gets a colour of its own
-    ends : x, y [m] of the start, and of a goal, where no route joins them
-    """
+    trajectory: np.ndarray | None = None  # (N, 2 or more) [m] camera centres; a row of NaN interrupts the line
+    route: np.ndarray | None = None  # (M, 2) [m] planned path
+    radius: float = 0.0  # [m] of the robot that it is planned for, and drawn as wide as
+    reached: np.ndarray | None = None  # (H, W) bool, cells that a robot can cover; free floor beyond them gets a colour of its own
+    ends: Sequence[Sequence[float]] = ()  # x, y [m] of the start, and of a goal, where no route joins them
+    began: tuple[float, float, float] | None = None  # x [m], y [m], yaw [rad] where the recording began, drawn as an arrow
+
+
+def save_picture(path: Path, grid: Grid, over: Overlay, *, title: str) -> None:
+    """Draw a grid, and what is to be seen upon it, into a PNG, PDF or SVG file; SlamError where the name ends otherwise."""
     path = Path(path)
     if path.suffix.lower() not in (".png", ".pdf", ".svg"):
         raise SlamError(f"{path}: not a kind of picture that can be drawn; name it *.png, *.pdf or *.svg")
@@ -38,38 +44,32 @@ def save_picture(path: Path, grid: Grid, *, trajectory: np.ndarray | None = None
     figure = Figure(figsize=tuple(inches))
     FigureCanvasAgg(figure)
     axis = figure.add_subplot()
-    draw(axis, grid, trajectory=trajectory, route=route, radius=radius, title=title, reached=reached, ends=ends)
+    draw(axis, grid, over, title=title)
     with files.whole(path) as file:
         figure.savefig(file, format=path.suffix[1:].lower(), dpi=130, bbox_inches="tight")
 
 
-def draw(axis: Any, grid: Grid, *, trajectory: np.ndarray | None = None, route: np.ndarray | None = None, radius: float = 0.0,
-         title: str = "", start: tuple[float, float, float] | None = None, font: float = 8.0, reached: np.ndarray | None = None,
-         ends: Sequence[Sequence[float]] = ()) -> None:  # fmt: skip
-    """Draw a grid into matplotlib axes, x to the right, y up; other arguments as of `save_picture`.
-
-    start : x [m], y [m], yaw [rad] where the recording began, drawn as an arrow
-    font : [pt] of the numbers and the legend
-    """
+def draw(axis: Any, grid: Grid, over: Overlay, *, title: str = "", font: float = 8.0) -> None:
+    """Draw a grid into matplotlib axes, x to the right, y up; `font` [pt] of the numbers and the legend."""
     from matplotlib.colors import ListedColormap
     from matplotlib.patches import Patch
 
     extent = _extent(grid)
     colours = {"unknown": COLOURS["unknown"], "free": COLOURS["free"], "occupied": COLOURS["occupied"]}
     shade = grid.state + 1
-    if reached is not None:
+    if over.reached is not None:
         colours = {"unknown": COLOURS["unknown"], "out of reach": OUT_OF_REACH, "free": COLOURS["free"], "occupied": COLOURS["occupied"]}
-        shade = np.where(shade == 0, 0, np.where((shade == 1) & ~reached, 1, shade + 1))
+        shade = np.where(shade == 0, 0, np.where((shade == 1) & ~over.reached, 1, shade + 1))
     shades = ListedColormap(list(colours.values()))
     axis.imshow(shade, origin="lower", extent=extent, cmap=shades, vmin=0, vmax=len(colours) - 1, interpolation="nearest")
     handles: list[Any] = [Patch(facecolor=colour, edgecolor="#888888", label=name) for name, colour in colours.items()][::-1]
-    if trajectory is not None and len(trajectory):
-        handles += axis.plot(trajectory[:, 0], trajectory[:, 1], color=TRAJECTORY, lw=1.0, label="camera")
-    if route is not None and len(route):
-        handles += _draw_route(axis, route, radius)
-    handles += _draw_ends(axis, ends)
-    if start is not None:
-        handles += _draw_start(axis, start, extent)
+    if over.trajectory is not None and len(over.trajectory):
+        handles += axis.plot(over.trajectory[:, 0], over.trajectory[:, 1], color=TRAJECTORY, lw=1.0, label="camera")
+    if over.route is not None and len(over.route):
+        handles += _draw_route(axis, over.route, over.radius)
+    handles += _draw_ends(axis, over.ends)
+    if over.began is not None:
+        handles += _draw_began(axis, over.began, extent)
     axis.set_xlim(extent[:2])
     axis.set_ylim(extent[2:])
     axis.set_aspect("equal")
@@ -103,9 +103,9 @@ def _draw_ends(axis: Any, ends: Sequence[Sequence[float]]) -> Sequence[Any]:
     return [line for end, look in zip(ends, looks, strict=False) for line in axis.plot(end[0], end[1], ls="none", **look)]
 
 
-def _draw_start(axis: Any, start: tuple[float, float, float], extent: tuple[float, float, float, float]) -> Sequence[Any]:
+def _draw_began(axis: Any, began: tuple[float, float, float], extent: tuple[float, float, float, float]) -> Sequence[Any]:
     """Draw where the recording began, and which way it looked."""
-    x, y, yaw = start
+    x, y, yaw = began
     length = 0.07 * max(extent[1] - extent[0], extent[3] - extent[2])
     axis.annotate(
         "", (x + length * np.cos(yaw), y + length * np.sin(yaw)), (x, y), arrowprops={"color": BEGAN, "arrowstyle": "-|>", "lw": 2.0}

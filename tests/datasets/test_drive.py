@@ -13,8 +13,8 @@ LOW, HIGH = np.zeros(3), np.array([8.0, 5.0, 2.6])
 
 def rounds(seed: int = 0, **changes: object) -> drive.Motion:
     rng = np.random.default_rng(seed)
-    settings = {"frames": 300, "speed": 0.6, "turn_rate": 0.8, "rate": 15.0, "laps": 1.1, "height": 0.75, "pitch": -0.2, **changes}
-    return drive.rounds(drive.closed_path(LOW, HIGH, 1.35, rng), rng=rng, **settings)
+    pace = drive.Pace(**{"frames": 300, "speed": 0.6, "turn_rate": 0.8, "rate": 15.0, "laps": 1.1, **changes})
+    return drive.rounds(drive.closed_path(LOW, HIGH, 1.35, rng), pace, height=0.75, pitch=-0.2, rng=rng)
 
 
 @pytest.mark.parametrize("seed", range(5))

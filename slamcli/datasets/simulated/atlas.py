@@ -3,8 +3,7 @@
 Light is computed once, as a coarse picture of each patch (lamps with soft shadows, ambient occlusion), and multiplied into its texture.
 """
 
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 from zlib import crc32
 
 import cv2
@@ -16,9 +15,8 @@ from slamcli.open3d_loader import load_open3d
 PACK = np.array([1, 1 << 8, 1 << 16], dtype=np.uint32)
 
 
-@dataclass(frozen=True)
-class Atlas:
-    """Planes and pictures of Q patches."""
+class Atlas(NamedTuple):
+    """Planes and pictures of Q patches, for points (x, 1) of one frame."""
 
     plane: np.ndarray  # (Q, 4) n, d with n . x + d = 0
     to_u: np.ndarray  # (Q, 4) texel column = to_u . (x, 1) at level 0, texel centres at whole numbers
@@ -27,6 +25,10 @@ class Atlas:
     size: np.ndarray  # (S, 2) int64, rows and columns of a level
     start: np.ndarray  # (S,) int64, its first texel
     texel: np.ndarray  # (N,) uint32, red + green << 8 + blue << 16: one load instead of three
+
+    def in_frame(self, T: np.ndarray) -> "Atlas":
+        """Return the atlas for points of another frame, from which T (4, 4) leads to this one."""
+        return self._replace(plane=self.plane @ T, to_u=self.to_u @ T, to_v=self.to_v @ T)
 
 
 def bake_light(patches: list[Patch], scene: Scene, raycasting: Any, texel: float) -> list[np.ndarray]:

@@ -22,6 +22,18 @@ class Motion:
     depth_T_lc: np.ndarray  # (F, 4, 4)
 
 
+@dataclass(frozen=True)
+class Pace:
+    """How fast a closed path is driven, and how far."""
+
+    frames: int | None  # images; None = as many as `speed` and `turn_rate` take at `rate`
+    speed: float  # [m/s] at most, where `frames` does not say how long it takes
+    turn_rate: float  # [rad/s] the same
+    rate: float  # [Hz] of images
+    laps: float  # rounds, any fraction
+    rest: float = 0.0  # [s] of standing still half-way
+
+
 def closed_path(low: np.ndarray, high: np.ndarray, margin: float, rng: np.random.Generator) -> np.ndarray:
     """Return a smooth closed path (DENSE, 2), `margin` from the walls: a superellipse with slight waves, counter-clockwise."""
     half = (high[:2] - low[:2]) / 2 - margin
@@ -41,27 +53,22 @@ def turned(path: np.ndarray, *, start: float, backwards: bool) -> np.ndarray:
     return np.roll(path[::-1], 1, axis=0) if backwards else path
 
 
-def rounds(
-    path: np.ndarray, *, frames: int | None, speed: float, turn_rate: float, rate: float, laps: float, height: float, pitch: float,
-    rng: np.random.Generator, rest: float = 0.0, ahead: float = 0.005,
-) -> Motion:  # fmt: skip
+def rounds(path: np.ndarray, pace: Pace, *, height: float, pitch: float, rng: np.random.Generator, ahead: float = 0.005) -> Motion:
     """Drive along a closed path.
 
-    frames : number of images; None = as many as `speed` [m/s] and `turn_rate` [rad/s], at most, take at `rate` [Hz]
-    laps : rounds, any fraction
-    rest : [s] of standing still half-way
-    ahead : share of the path on either side over which its direction is taken
     height, pitch : of the camera [m], [rad], positive up; the robot rocks by some millimetres and tenths of a degree
+    ahead : share of the path on either side over which its direction is taken
     """
+    rate = pace.rate
     step = np.roll(path, -1, axis=0) - path
     length = np.linalg.norm(step, axis=1)
     heading = np.unwrap(np.arctan2(step[:, 1], step[:, 0]))
     turn = np.abs(np.diff(heading, append=heading[0] + 2 * np.pi * np.round((heading[-1] - heading[0]) / (2 * np.pi))))
-    seconds = smoothed(np.hypot(length / speed, turn / turn_rate)[:, None], 0.02)[:, 0]
+    seconds = smoothed(np.hypot(length / pace.speed, turn / pace.turn_rate)[:, None], 0.02)[:, 0]
     clock = np.concatenate([[0.0], np.cumsum(seconds)])  # at each point of the path, over one lap
-    total = laps * clock[-1]
-    n = frames if frames is not None else max(2, round(total * rate) + 1) + round(rest * rate)
-    when = _clock(total, n, rate, rest)
+    total = pace.laps * clock[-1]
+    n = pace.frames if pace.frames is not None else max(2, round(total * rate) + 1) + round(pace.rest * rate)
+    when = _clock(total, n, rate, pace.rest)
     share = np.interp(when % clock[-1], clock, np.arange(DENSE + 1) / DENSE) + when // clock[-1]
     xy, psi = _at(path, share), _heading_at(path, share, ahead)
     wobble = [_sway(share, rng) for _ in range(5)]

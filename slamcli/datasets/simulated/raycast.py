@@ -79,11 +79,7 @@ class Renderer:
         return patch_of[np.where(hit < len(patch_of), hit, np.roll(hit, 1)).clip(0, len(patch_of) - 1)]
 
     def _shade(self, T_lc: np.ndarray, rays: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        a = self._atlas
-        plane_c, to_u_c, to_v_c = a.plane @ T_lc, a.to_u @ T_lc, a.to_v @ T_lc
-        return _shade_kernel(
-            rays, seen, 1 / self._camera.fx, 1 / self._camera.fy, plane_c, to_u_c, to_v_c, a.level, a.size, a.start, a.texel
-        )
+        return _shade_kernel(rays, seen, (1 / self._camera.fx, 1 / self._camera.fy), self._atlas.in_frame(T_lc))
 
 
 def _triangles(patches: list[Patch]) -> tuple[np.ndarray, np.ndarray]:
@@ -159,10 +155,9 @@ def _depth_kernel(rays, seen, plane_c):
 
 
 @kernel
-def _shade_kernel(rays, seen, pixel_x, pixel_y, plane_c, to_u_c, to_v_c, level, size, start, texel):
-    """Sample the pictures under N camera rays (N, 2), a pixel being `pixel_x` x `pixel_y` wide in ray coordinates.
+def _shade_kernel(rays, seen, pixel, atlas):
+    """Sample the pictures under N camera rays (N, 2); `pixel` is a pixel's width and height in ray coordinates, `atlas` in the camera frame.
 
-    plane_c, to_u_c, to_v_c : (Q, 4), as in Atlas but for points in the camera frame
     Returns rgb (N, 3) float32, and depth and cosine as `_depth_kernel` does.
 
     The footprint of a pixel in its picture is a parallelogram: its width chooses the mip level (trilinear), taps are spread along its
@@ -172,6 +167,8 @@ def _shade_kernel(rays, seen, pixel_x, pixel_y, plane_c, to_u_c, to_v_c, level, 
     depth = np.empty(len(rays), np.float32)
     cosine = np.empty(len(rays), np.float32)
     one = np.float32(1.0)
+    pixel_x, pixel_y = pixel
+    plane_c, to_u_c, to_v_c, level, size, start, texel = atlas
     for i in range(len(rays)):
         q, x, y = seen[i], rays[i, 0], rays[i, 1]
         slope = plane_c[q, 0] * x + plane_c[q, 1] * y + plane_c[q, 2]

@@ -1,6 +1,7 @@
 """Furnish a simulated room: paint, pictures, furniture along the walls, an island in the middle, a hanging box and a low box."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -31,40 +32,47 @@ WALL_FRAMES = {
 }
 
 
-def furnished_room(
-    low: np.ndarray,
-    high: np.ndarray,
-    path: np.ndarray,
-    *,
-    seed: int,
-    twin: int = 0,
-    twins: bool = False,
-    movable: bool = False,
-    empty: bool = False,
-    moved_chair: bool = False,
-) -> Scene:
+@dataclass(frozen=True)
+class Furnishing:
+    """What a room is furnished with."""
+
+    twin: int = 0  # another number is another room with the same patterns and the same kinds of pieces
+    twin_walls: bool = False  # opposite walls look the same
+    movable: bool = False  # a large parcel beside the path, marked as movable
+    empty: bool = False  # with nothing
+    moved_chair: bool = False  # places for a chair beside the path
+
+
+@dataclass(frozen=True)
+class Where:
+    """Where a piece may stand."""
+
+    near: np.ndarray | None = None  # (2,) [m]; None = anywhere
+    spread: float = 0.0  # [m] from `near` along each axis
+    clearance: float = CLEARANCE  # [m] between it and the camera's path
+    most: float = np.inf  # [m] the same, at most
+    gap: float = 0.3  # [m] between it and other pieces
+
+
+def furnished_room(low: np.ndarray, high: np.ndarray, path: np.ndarray, *, seed: int, furnishing: Furnishing) -> Scene:
     """Furnish a room so that the camera's path never comes near an object.
 
     low, high : (3,) [m] corners of the room
     path : (N, 3) [m] camera centres
-    twin : another number is another room with the same patterns and the same kinds of pieces
-    twins : opposite walls look the same
-    movable : put a large parcel beside the path, marked as movable
-    empty : put nothing into it
-    moved_chair : find places for a chair beside the path
     """
+    twin, twins = furnishing.twin, furnishing.twin_walls
     rng = np.random.default_rng([seed, 0, *([twin] if twin else [])])
     free = FreeSpace(low, high, path)
     walls, doorways = _paint_walls(low, high, rng, twins)
     for doorway in doorways:
         free.take(_floor_before(doorway))
     solids: list[Solid] = []
-    if not empty:
-        _special_boxes(solids, free, rng, high[2], movable)
+    if not furnishing.empty:
+        _special_boxes(solids, free, rng, high[2], furnishing.movable)
         _island(solids, free, rng)
         along_walls(solids, free, rng)
         _scatter(solids, free, rng)
-    chair_places = _places_of_a_chair(free, np.random.default_rng([seed, 7])) if moved_chair else ()
+    chair_places = _places_of_a_chair(free, np.random.default_rng([seed, 7])) if furnishing.moved_chair else ()
     lamps = _lamps(low, high)
     base = pick(rng, (t.planks((196, 150, 100)), t.planks((150, 106, 72)), t.tiles((206, 198, 184)), t.planks((214, 186, 146))))
     floor = p.floor(base, _rugs(low, high, rng))
@@ -231,15 +239,15 @@ def along_walls(solids: list[Solid], free: FreeSpace, rng: np.random.Generator) 
 
 
 def _place_freely(
-    piece: Piece, solids: list[Solid], free: FreeSpace, rng: np.random.Generator, *, near: np.ndarray | None = None, spread: float = 0.0,
-    clearance: float = CLEARANCE, most: float = np.inf, gap: float = 0.3, attempts: int = 300,
-) -> bool:  # fmt: skip
-    """Put a piece at a random place, or near one, in steps of a right angle; `most` bounds the distance to the path [m]."""
+    piece: Piece, solids: list[Solid], free: FreeSpace, rng: np.random.Generator, where: Where, *, attempts: int = 300
+) -> bool:
+    """Put a piece at a random place, turned by a multiple of a right angle, and say whether there was one."""
     for _ in range(attempts):
         yaw = np.pi / 2 * rng.integers(4)
-        xy = rng.uniform(free.low, free.high) if near is None else near + rng.uniform(-spread, spread, 2)
+        xy = rng.uniform(free.low, free.high) if where.near is None else where.near + rng.uniform(-where.spread, where.spread, 2)
         rect = _rect(xy[0], xy[1], yaw, piece)
-        if free.fits(rect, piece.height, gap=gap, clearance=clearance) and free.distance_to_path(rect, piece.height) <= most:
+        fits = free.fits(rect, piece.height, gap=where.gap, clearance=where.clearance)
+        if fits and free.distance_to_path(rect, piece.height) <= where.most:
             free.take(rect)
             solids += piece.at(xy[0], xy[1], yaw)
             return True
@@ -259,7 +267,8 @@ def _special_boxes(solids: list[Solid], free: FreeSpace, rng: np.random.Generato
         pieces.append(Piece("moved_box", 0.55, 0.5, 0.55, [parcel]))
     for piece in pieces:
         # A low box lies where the robot would drive over it, a hanging one where it would drive under it: beside the path, never on it.
-        if not any(_place_freely(piece, solids, free, rng, clearance=0.3, most=most, gap=0.35) for most in (0.8, 1.5, np.inf)):
+        places = (Where(clearance=0.3, most=most, gap=0.35) for most in (0.8, 1.5, np.inf))
+        if not any(_place_freely(piece, solids, free, rng, where) for where in places):
             raise SlamError(f"simulated room: no place for the {piece.name} beside this path; try another seed or a larger room")
 
 
@@ -269,7 +278,7 @@ def _places_of_a_chair(free: FreeSpace, rng: np.random.Generator) -> tuple[list[
     places = list[list[Solid]]()
     for _ in range(CHAIR_PLACES):
         solids = list[Solid]()
-        if _place_freely(piece, solids, free, rng, most=CHAIR_TO_PATH, gap=0.1):
+        if _place_freely(piece, solids, free, rng, Where(most=CHAIR_TO_PATH, gap=0.1)):
             places.append(solids)
     if len(places) < 2:
         raise SlamError("simulated room: no two places for a chair beside this path; try another seed or a larger room")
@@ -280,10 +289,11 @@ def _island(solids: list[Solid], free: FreeSpace, rng: np.random.Generator) -> N
     """Put a table with chairs into the middle, if the path leaves room for it."""
     centre = (free.low + free.high) / 2
     piece = furniture.table("island", rng, width=rng.uniform(1.5, 1.9), depth=0.75)
-    if not _place_freely(piece, solids, free, rng, near=centre, spread=0.9, clearance=0.45, gap=0.3):
+    if not _place_freely(piece, solids, free, rng, Where(near=centre, spread=0.9, clearance=0.45)):
         return
     for k in range(2):
-        _place_freely(furniture.chair(f"chair_{k}", rng), solids, free, rng, near=centre, spread=1.6, gap=0.05, attempts=60)
+        chair = furniture.chair(f"chair_{k}", rng)
+        _place_freely(chair, solids, free, rng, Where(near=centre, spread=1.6, gap=0.05), attempts=60)
 
 
 def _scatter(solids: list[Solid], free: FreeSpace, rng: np.random.Generator) -> None:
@@ -297,4 +307,4 @@ def _scatter(solids: list[Solid], free: FreeSpace, rng: np.random.Generator) -> 
     )
     for k in range(int(max(0.0, area - 40.0) / 6.0)):
         piece = makers[k % len(makers)](f"scattered_{k}", rng)
-        _place_freely(piece, solids, free, rng, clearance=0.6, gap=0.6, attempts=60)
+        _place_freely(piece, solids, free, rng, Where(clearance=0.6, gap=0.6), attempts=60)
