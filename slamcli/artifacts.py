@@ -109,10 +109,7 @@ class Writer(Generic[Record]):
             _save_field(self._cls, self._specs[name], value, self._folder)
         for column in self._growing.values():
             column.finish()
-        record = load(self._cls, self._folder)
-        for name in self._specs:
-            mapped_memory.adopt(getattr(record, name))
-        return record
+        return adopted(load(self._cls, self._folder))
 
 
 class _Growing:
@@ -177,6 +174,13 @@ def load(cls: type[Record], folder: Path) -> Record:
     except ValueError as error:
         raise SlamError(f"{folder}: not what this version of slamcli writes ({error}); make it anew with: slamcli run --force") from error
     return value
+
+
+def adopted(record: Record) -> Record:
+    """Return a loaded record that is read alone: within a stage the memory of its arrays may be let go at any time."""
+    for spec in fields(record):  # type: ignore[arg-type]
+        mapped_memory.adopt(getattr(record, spec.name))
+    return record
 
 
 def _read(path: Path) -> np.ndarray:

@@ -7,7 +7,7 @@ import math
 import platform
 import zlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from types import MappingProxyType
@@ -74,13 +74,10 @@ class Inputs:
 
     def load(self, cls: type[Record], stage: str) -> Record:
         """Read a record of arrays that `stage` wrote; nothing may be written to them."""
-        from slamcli import artifacts, mapped_memory
+        from slamcli import artifacts
 
         names = artifacts.file_names(cls)
-        record = artifacts.load(cls, self._run.intact(self._declared(stage), *names))
-        for name in (spec.name for spec in fields(record)):  # type: ignore[arg-type]
-            mapped_memory.adopt(getattr(record, name))
-        return record
+        return artifacts.adopted(artifacts.load(cls, self._run.intact(self._declared(stage), *names)))
 
     def camera(self, stage: str = "extract") -> "Camera":
         """Return the intrinsics that extract used, or those known after optimize or loop."""

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from slamcli import artifacts, files
+from slamcli import artifacts, files, mapped_memory
 from slamcli.calibration import self_calibration
 from slamcli.calibration.self_calibration import Sensing
 from slamcli.config.options import Config
@@ -42,9 +42,10 @@ from slamcli.schema import (
 )
 from slamcli.slam import depth_views, doubt, map_segments, moving_objects
 from slamcli.slam.doubt import Finding
+from slamcli.stages import match
 from slamcli.stages.association_file import write_association
 from slamcli.stages.camera_file import write_camera
-from slamcli.stages.contract import Inputs, Stored, Summary, Tools
+from slamcli.stages.contract import Inputs, Record, Stored, Summary, Tools
 from slamcli.stages.map_outputs import save_map
 from slamcli.stages.moving_parts import coarse_images
 from slamcli.stages.of_several import NAMES_FILE
@@ -67,28 +68,38 @@ class Part:
         """Read the recording's own camera."""
         return self.made.camera("extract")
 
+    def load(self, cls: type[Record], stage: str) -> Record:
+        """Read a record of arrays that `stage` wrote, to be read alone."""
+        return artifacts.adopted(self.made.load(cls, stage))
+
 
 def join_extract(parts: Sequence[Part], inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
     """Join the features of recordings, and their coarse depth."""
     dataset = inputs.dataset
     assert isinstance(dataset, JoinedDataset)
-    found = [part.made.load(Features, "extract") for part in parts]
+    found = [part.load(Features, "extract") for part in parts]
     how = [dataset.retelling(k) for k in range(len(parts))]
     has_depth = np.concatenate([np.isfinite(one.depth_stamp) for one in found])
-    joined = Features(
-        stamp=dataset.stamp,
-        depth_stamp=np.where(has_depth, dataset.depth_stamp, np.nan),
-        offset=_offsets([one.offset for one in found]),
-        xy=np.concatenate([h.pixels(np.asarray(one.xy)) for one, h in zip(found, how, strict=True)]),
-        depth=np.concatenate([one.depth for one in found]),
-        slope=np.concatenate([one.slope * np.float32(1.0 / h.magnification) for one, h in zip(found, how, strict=True)]),
-        octave=np.concatenate([_octaves(one, h) for one, h in zip(found, how, strict=True)]),
-        angle=np.concatenate([one.angle for one in found]),
-        desc=np.concatenate([one.desc for one in found]),
-        octave_scale=np.array(found[0].octave_scale),
-    )
-    artifacts.save(joined, out)
-    artifacts.save(_coarse(parts, how, dataset.camera), out)
+    n_with_depth = 0
+    with artifacts.Writer(Features, out, "xy", "depth", "slope", "octave", "angle", "desc") as writer:
+        for one, h in zip(found, how, strict=True):
+            for rows in mapped_memory.blocks(one.desc):
+                writer.append(
+                    xy=h.pixels(one.xy[rows]),
+                    depth=one.depth[rows],
+                    slope=one.slope[rows] * np.float32(1.0 / h.magnification),
+                    octave=_octaves(one.octave[rows], float(one.octave_scale), h),
+                    angle=one.angle[rows],
+                    desc=one.desc[rows],
+                )
+                n_with_depth += int(np.isfinite(one.depth[rows]).sum())
+        joined = writer.finish(
+            stamp=dataset.stamp,
+            depth_stamp=np.where(has_depth, dataset.depth_stamp, np.nan),
+            offset=_offsets([one.offset for one in found]),
+            octave_scale=np.array(found[0].octave_scale),
+        )
+    _save_coarse(parts, how, dataset.camera, out)
     artifacts.save(Flow(), out)
     artifacts.save(dataset.recordings(), out)
     files.write_text(out / NAMES_FILE, json.dumps(dataset.names) + "\n")
@@ -97,7 +108,7 @@ def join_extract(parts: Sequence[Part], inputs: Inputs, out: Path, cfg: Config, 
     n = np.diff(joined.offset)
     return _added(parts) | {
         "features_per_frame": [int(n.min()), float(np.median(n)), int(n.max())],
-        "with_depth": float(np.isfinite(joined.depth).mean()) if len(joined.depth) else 0.0,
+        "with_depth": n_with_depth / max(1, int(n.sum())),
         "recordings": len(parts),
     }
 
@@ -105,25 +116,23 @@ def join_extract(parts: Sequence[Part], inputs: Inputs, out: Path, cfg: Config, 
 def join_match(parts: Sequence[Part], inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
     """Join the words of recordings and the matches within them; none are sought between them."""
     first = inputs.load(Recordings, "extract").recording_offset
-    words = [part.made.load(Words, "match") for part in parts]
-    matches = [part.made.load(Matches, "match") for part in parts]
-    joined = Words(
-        idf=np.array(words[0].idf),
-        word_offset=_offsets([one.word_offset for one in words]),
-        word=np.concatenate([one.word for one in words]),
-        node=np.concatenate([one.node for one in words]),
-    )
-    artifacts.save(joined, out)
-    pairs = Matches(
-        pair=np.concatenate([one.pair + np.int32(at) for one, at in zip(matches, first, strict=False)]),
-        offset=_offsets([one.offset for one in matches]),
-        row=np.concatenate([one.row for one in matches]),
-    )
-    artifacts.save(pairs, out)
+    words = [part.load(Words, "match") for part in parts]
+    matches = [part.load(Matches, "match") for part in parts]
+    with artifacts.Writer(Words, out, "word", "node") as word_writer:
+        for word, node in ((one.word[rows], one.node[rows]) for one in words for rows in mapped_memory.blocks(one.node)):
+            word_writer.append(word=word.astype(np.int32), node=node.astype(np.int32))
+        joined = word_writer.finish(idf=np.array(words[0].idf), word_offset=_offsets([one.word_offset for one in words]))
+    with artifacts.Writer(Matches, out, "row") as match_writer:
+        for row in (one.row[rows] for one in matches for rows in mapped_memory.blocks(one.row)):
+            match_writer.append(row=row.astype(np.int32))
+        pairs = match_writer.finish(
+            pair=np.concatenate([one.pair + np.int32(at) for one, at in zip(matches, first, strict=False)]),
+            offset=_offsets([one.offset for one in matches]),
+        )
     return _added(parts) | {
         "matches_per_pair": float(np.median(np.diff(pairs.offset))) if len(pairs.pair) else 0.0,
         "words": len(joined.idf),
-        "words_seen": int((joined.idf[np.unique(joined.word)] > 0).sum()),
+        "words_seen": int((joined.idf[match.seen(joined)] > 0).sum()),
     }
 
 
@@ -164,7 +173,7 @@ def join_optimize(parts: Sequence[Part], inputs: Inputs, out: Path, cfg: Config,
     timings = [part.made.load(Timing, "optimize") for part in parts]
     twist = np.concatenate([timing.twist for timing in timings])
     artifacts.save(Timing(np.array(0.0), np.array(np.nan), np.array(0.0), twist=twist), out)
-    artifacts.save(_measured(parts, timings, camera), out)
+    _save_measured(parts, timings, camera, out)
     delay = np.repeat([float(timing.depth_delay) for timing in timings], np.diff(offset))
     artifacts.save(DepthTimes(depth_time=features.depth_stamp + delay), out)
     write_camera(out, camera)
@@ -194,22 +203,24 @@ def _starts(lengths: Sequence[int]) -> np.ndarray:
     return np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64)
 
 
-def _octaves(features: Features, how: Retelling) -> np.ndarray:
-    """Tell octaves as the common camera would have seen the points: as finely as it resolves, so much blurred are they there."""
+def _octaves(octave: np.ndarray, scale: float, how: Retelling) -> np.ndarray:
+    """Tell octaves (N,) as the common camera would have seen the points: as finely as it resolves, so much blurred are they there."""
     if how.is_identity:
-        return features.octave
-    levels = np.round(elementary.log(how.magnification) / elementary.log(float(features.octave_scale)))
-    return np.clip(features.octave + levels, 0, LARGEST_OCTAVE).astype(np.uint8)
+        return octave
+    levels = np.round(elementary.log(how.magnification) / elementary.log(scale))
+    return np.clip(octave + levels, 0, LARGEST_OCTAVE).astype(np.uint8)
 
 
-def _coarse(parts: Sequence[Part], how: Sequence[Retelling], common: Camera) -> CoarseDepth:
+def _save_coarse(parts: Sequence[Part], how: Sequence[Retelling], common: Camera, out: Path) -> None:
     """Join the coarse depth images of recordings; code is taken as it is where the camera is the common one."""
-    told = [part.made.load(CoarseDepth, "extract") if h.is_identity else _retold(part, h) for part, h in zip(parts, how, strict=True)]
-    return CoarseDepth(
-        coarse_shape=np.array(icp.coarse_shape(common), dtype=np.int32),
-        coarse_offset=_offsets([one.coarse_offset for one in told]),
-        coarse_code=np.concatenate([one.coarse_code for one in told]),
-    )
+    offsets = []
+    with artifacts.Writer(CoarseDepth, out, "coarse_code") as writer:
+        for part, h in zip(parts, how, strict=True):
+            told = part.load(CoarseDepth, "extract") if h.is_identity else _retold(part, h)
+            offsets.append(told.coarse_offset)
+            for rows in mapped_memory.blocks(told.coarse_code):
+                writer.append(coarse_code=told.coarse_code[rows])
+        writer.finish(coarse_shape=np.array(icp.coarse_shape(common), dtype=np.int32), coarse_offset=_offsets(offsets))
 
 
 def _retold(part: Part, how: Retelling) -> CoarseDepth:
@@ -258,13 +269,14 @@ def _joined_map(parts: Sequence[Part], stage: str, features: Features, offset: n
     return found, map_segments.ranked(joined, found)
 
 
-def _measured(parts: Sequence[Part], timings: Sequence[Timing], camera: Camera) -> Measured:
-    xy, depth = [], []
-    for part, timing in zip(parts, timings, strict=True):
-        corrected = self_calibration.correct(part.made.load(Features, "extract"), part.camera, Sensing(part.camera, timing, {}))
-        xy.append(Retelling(part.camera, camera).pixels(corrected.xy))
-        depth.append(corrected.depth)
-    return Measured(measured_xy=np.concatenate(xy), measured_depth=np.concatenate(depth))
+def _save_measured(parts: Sequence[Part], timings: Sequence[Timing], camera: Camera, out: Path) -> None:
+    with artifacts.Writer(Measured, out, "measured_xy", "measured_depth") as writer:
+        for part, timing in zip(parts, timings, strict=True):
+            corrected = self_calibration.correct(part.load(Features, "extract"), part.camera, Sensing(part.camera, timing, {}))
+            how = Retelling(part.camera, camera)
+            for rows in mapped_memory.blocks(corrected.xy):
+                writer.append(measured_xy=how.pixels(corrected.xy[rows]), measured_depth=corrected.depth[rows])
+        writer.finish()
 
 
 def _moving(parts: Sequence[Part], camera: Camera) -> Moving:

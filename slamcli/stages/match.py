@@ -32,7 +32,7 @@ def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
         "pairs": len(pairs),
         "matches_per_pair": float(np.median(np.diff(matches.offset))) if pairs else 0.0,
         "words": len(words.idf),
-        "words_seen": int((words.idf[_seen(words)] > 0).sum()),
+        "words_seen": int((words.idf[seen(words)] > 0).sum()),
     }
 
 
@@ -45,7 +45,7 @@ def _words(features: Features, words: vocabulary.Vocabulary, settings: MatchConf
         return writer.finish(idf=words.idf, word_offset=np.array(features.offset))
 
 
-def _seen(words: Words) -> np.ndarray:
+def seen(words: Words) -> np.ndarray:
     """Say which words (W,) occur."""
     is_seen = np.zeros(len(words.idf), dtype=bool)
     for rows in mapped_memory.blocks(words.word):
