@@ -74,7 +74,7 @@ def _copies(stream: Stream) -> np.ndarray:
     """
     stamp = np.asarray(stream.stamp, dtype=np.float64)
     is_copy, source = np.concatenate([[False], np.diff(stamp) == 0.0]), stream.images
-    if is_copy[1:].mean() <= MANY_REPEATED or (~is_copy).sum() < ENOUGH:
+    if (~is_copy).sum() < ENOUGH or is_copy[1:].mean() <= MANY_REPEATED:
         return np.zeros_like(is_copy)
     is_copy[is_copy] = [source.n_bytes(int(i)) == source.n_bytes(int(i) - 1) for i in np.flatnonzero(is_copy)]
     rows = np.flatnonzero(is_copy)
