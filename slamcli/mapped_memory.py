@@ -82,7 +82,7 @@ def copy(array: np.ndarray) -> np.ndarray:
 
 
 def by_blocks(values: Callable[[slice], np.ndarray], n: int, tail: tuple[int, ...], dtype: np.typing.DTypeLike) -> np.ndarray:
-    """Make an array (n, *tail) as `empty` does, a block of rows at a time, of what `values` gives for a slice of them."""
+    """Make an array (n, *tail) as `empty` does, a block of rows at a time, of what `values` gives, or gives each row, for a slice of them."""
     out = empty((n, *tail), dtype)
     for rows in blocks(out):
         out[rows] = values(rows)

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from slamcli import mapped_memory
 from slamcli.geometry import elementary, se3
 from slamcli.schema import Features, Map
 from slamcli.sparse_map import observation_chains
@@ -52,7 +53,7 @@ class SparseMap:
             T_ij=("f8", 4, 4),  # measured by depth ICP: x_i = T_ij x_j
             information=("f8", 6, 6),  # of its left twist (rho, phi) [1/m^2, 1/rad^2]
         )
-        self.lm_of_row = np.full(int(features.offset[-1]), -1, dtype=np.int32)
+        self.lm_of_row = mapped_memory.by_blocks(lambda rows: np.array(-1), int(features.offset[-1]), (), np.int32)
 
     def add_key_frame(self, frame: int, T_wk: np.ndarray, segment: int = 0) -> int:
         """Add a key frame without observations; returns its row."""
