@@ -76,6 +76,17 @@ def window_means(depth: f4[:, ::1], side: i8, first: i8, width: i8, out: f4[:, :
 
 
 @kernel(error_model="numpy")
+def _shown_at(x, y, z, view):
+    """Return the point that a view shows where a place of its camera's frame projects to, -1 = none."""
+    if not z > Z_MIN:
+        return -1
+    u, v = view.pinhole[0] * x / z + view.pinhole[2] + 0.5, view.pinhole[1] * y / z + view.pinhole[3] + 0.5
+    if not (u >= 0.0 and v >= 0.0 and u < view.row.shape[1] and v < view.row.shape[0]):
+        return -1
+    return view.row[int(v), int(u)]
+
+
+@kernel(error_model="numpy")
 def _normal_equations(T, source, target, view, now, rule, out):
     """Write H = sum w J^T J and b = -sum w J^T r over every `now.step`-th point of j; return points met, points that agree, sum of w chi2.
 
@@ -87,7 +98,6 @@ def _normal_equations(T, source, target, view, now, rule, out):
     """
     xyz_j, normal_j, variance_j = source
     xyz_i, normal_i, variance_i = target
-    row_i, pinhole = view
     min_cosine, limit, _ = rule
     step, reach, is_final = now
     H, b = out
@@ -95,19 +105,11 @@ def _normal_equations(T, source, target, view, now, rule, out):
     h33 = h34 = h35 = h44 = h45 = h55 = b0 = b1 = b2 = b3 = b4 = b5 = cost = 0.0
     T00, T01, T02, T03, T10, T11, T12, T13 = T[0, 0], T[0, 1], T[0, 2], T[0, 3], T[1, 0], T[1, 1], T[1, 2], T[1, 3]
     T20, T21, T22, T23 = T[2, 0], T[2, 1], T[2, 2], T[2, 3]
-    height, width = row_i.shape
     met, agree = 0, 0
     for j in range(0, len(xyz_j), step):
         x, y, z = xyz_j[j, 0], xyz_j[j, 1], xyz_j[j, 2]
-        qz = T20 * x + T21 * y + T22 * z + T23
-        if not qz > Z_MIN:
-            continue
-        qx = T00 * x + T01 * y + T02 * z + T03
-        qy = T10 * x + T11 * y + T12 * z + T13
-        u, v = pinhole[0] * qx / qz + pinhole[2] + 0.5, pinhole[1] * qy / qz + pinhole[3] + 0.5
-        if not (u >= 0.0 and v >= 0.0 and u < width and v < height):
-            continue
-        i = row_i[int(v), int(u)]
+        qx, qy, qz = T00 * x + T01 * y + T02 * z + T03, T10 * x + T11 * y + T12 * z + T13, T20 * x + T21 * y + T22 * z + T23
+        i = _shown_at(qx, qy, qz, view)
         if i < 0:
             continue
         met += 1

@@ -144,36 +144,44 @@ def linearize(at: Variables, seen: Sightings, measured: f8[:, ::1], camera: f8[:
                     row[0], row[1], row[2], row[3], row[4], row[5] = p0, p1, p2, y * p2 - z * p1, z * p0 - x * p2, x * p1 - y * p0
             if f < 0:
                 continue
-            u, g = U[f], b_c[f]
-            c03, c04, c05 = y * m02, z * m00 - x * m02, -y * m00
-            c13, c14, c15 = y * m12 - z * m11, -x * m12, x * m11
-            c23, c24, c25 = y * m22 - z * m12, z * m02 - x * m22, x * m12 - y * m02
-            u[0, 0] += m00
-            u[0, 2] += m02
-            u[0, 3] += c03
-            u[0, 4] += c04
-            u[0, 5] += c05
-            u[1, 1] += m11
-            u[1, 2] += m12
-            u[1, 3] += c13
-            u[1, 4] += c14
-            u[1, 5] += c15
-            u[2, 2] += m22
-            u[2, 3] += c23
-            u[2, 4] += c24
-            u[2, 5] += c25
-            u[3, 3] += y * c23 - z * c13
-            u[3, 4] += y * c24 - z * c14
-            u[3, 5] += y * c25 - z * c15
-            u[4, 4] += z * c04 - x * c24
-            u[4, 5] += z * c05 - x * c25
-            u[5, 5] += x * c15 - y * c05
-            g[0] -= q0
-            g[1] -= q1
-            g[2] -= q2
-            g[3] -= y * q2 - z * q1
-            g[4] -= z * q0 - x * q2
-            g[5] -= x * q1 - y * q0
+            _add_to_key_frame(U[f], b_c[f], (x, y, z), (m00, m02, m11, m12, m22), (q0, q1, q2))
+
+
+@kernel(error_model="numpy")
+def _add_to_key_frame(u, g, x_c, M, q):
+    """Add [I; x_c^] M [I, -x_c^] to the upper triangle of u (6, 6), and -[q; x_c x q] to g (6,)."""
+    x, y, z = x_c
+    m00, m02, m11, m12, m22 = M
+    q0, q1, q2 = q
+    c03, c04, c05 = y * m02, z * m00 - x * m02, -y * m00
+    c13, c14, c15 = y * m12 - z * m11, -x * m12, x * m11
+    c23, c24, c25 = y * m22 - z * m12, z * m02 - x * m22, x * m12 - y * m02
+    u[0, 0] += m00
+    u[0, 2] += m02
+    u[0, 3] += c03
+    u[0, 4] += c04
+    u[0, 5] += c05
+    u[1, 1] += m11
+    u[1, 2] += m12
+    u[1, 3] += c13
+    u[1, 4] += c14
+    u[1, 5] += c15
+    u[2, 2] += m22
+    u[2, 3] += c23
+    u[2, 4] += c24
+    u[2, 5] += c25
+    u[3, 3] += y * c23 - z * c13
+    u[3, 4] += y * c24 - z * c14
+    u[3, 5] += y * c25 - z * c15
+    u[4, 4] += z * c04 - x * c24
+    u[4, 5] += z * c05 - x * c25
+    u[5, 5] += x * c15 - y * c05
+    g[0] -= q0
+    g[1] -= q1
+    g[2] -= q2
+    g[3] -= y * q2 - z * q1
+    g[4] -= z * q0 - x * q2
+    g[5] -= x * q1 - y * q0
 
 
 @kernel(error_model="numpy")

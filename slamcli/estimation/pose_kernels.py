@@ -205,14 +205,8 @@ def _rms(T, x_w, xy, camera, is_inlier):
 
 
 @kernel(error_model="numpy")
-def refine(T: f8[:, ::1], given: Seen, camera: f8[::1], loss: Huber, is_inlier: b1[::1]):
-    """Levenberg-Marquardt on T (4, 4), with the inliers (N,) found anew after each round, in place.
-
-    given : as it was measured; camera : fx, fy, cx, cy [px]
-    is_inlier : written; an observation with a value that is not finite is never one
-    Returns the pose, its information (6, 6), the robust cost of the inliers, the iterations done, and the root
-    mean square reprojection error [px] of the inliers, NaN without any.
-    """
+def _usable(given, is_inlier):
+    """Return what was measured with NaN for what is not finite; write which observations have all that they need."""
     n = len(given.x_w)
     seen = Seen(np.empty((n, 3)), given.xy, np.empty(n), given.inv_px, given.inv_z)
     for i in range(n):
@@ -222,6 +216,40 @@ def refine(T: f8[:, ::1], given: Seen, camera: f8[::1], loss: Huber, is_inlier: 
         for k in range(3):  # NaN is never in front of the camera: an outlier from the start
             seen.x_w[i, k] = given.x_w[i, k] if is_inlier[i] else np.nan
         seen.depth[i] = given.depth[i] if is_deep else np.nan
+    return seen
+
+
+@kernel(error_model="numpy")
+def _expected_decrease(at, damping, step):
+    """Return by how much a damped step lowers the cost, as the linearized problem foretells it."""
+    expected = 0.0
+    for i in range(6):
+        expected += step[i] * (at.b[i] + damping * at.H[i, i] * step[i])
+    return expected
+
+
+@kernel(error_model="numpy")
+def _sort_again(chi2, depth, loss, is_inlier):
+    """Find the inliers anew; say whether any changed."""
+    changed = False
+    for i in range(len(chi2)):
+        inside = chi2[i] <= (loss.with_depth if depth[i] == depth[i] else loss.pixel)
+        if inside != is_inlier[i]:
+            is_inlier[i] = inside
+            changed = True
+    return changed
+
+
+@kernel(error_model="numpy")
+def refine(T: f8[:, ::1], given: Seen, camera: f8[::1], loss: Huber, is_inlier: b1[::1]):
+    """Levenberg-Marquardt on T (4, 4), with the inliers (N,) found anew after each round, in place.
+
+    given : as it was measured; camera : fx, fy, cx, cy [px]
+    is_inlier : written; an observation with a value that is not finite is never one
+    Returns the pose, its information (6, 6), the robust cost of the inliers, the iterations done, and the root
+    mean square reprojection error [px] of the inliers, NaN without any.
+    """
+    n, seen = len(given.x_w), _usable(given, is_inlier)
     at, at_trial = System(np.empty((6, 6)), np.empty(6), np.empty(n)), System(np.empty((6, 6)), np.empty(6), np.empty(n))
     trial, step, L = np.empty((4, 4)), np.empty(6), np.empty((6, 6))
     total = 0
@@ -235,10 +263,7 @@ def refine(T: f8[:, ::1], given: Seen, camera: f8[::1], loss: Huber, is_inlier: 
                 if damping > DAMPING_MAX:
                     break
                 continue
-            expected = 0.0
-            for i in range(6):
-                expected += step[i] * (at.b[i] + damping * at.H[i, i] * step[i])
-            if expected <= 1e-9 * (1.0 + cost):
+            if _expected_decrease(at, damping, step) <= 1e-9 * (1.0 + cost):
                 break
             for i in range(4):  # trial[:, :] = T would take 6 s to compile, for the text of the error its shape check may raise
                 for j in range(4):
@@ -253,13 +278,7 @@ def refine(T: f8[:, ::1], given: Seen, camera: f8[::1], loss: Huber, is_inlier: 
                 damping *= 10.0
                 if damping > DAMPING_MAX:
                     break
-        changed = False
-        for i in range(n):
-            inside = at.chi2[i] <= (loss.with_depth if seen.depth[i] == seen.depth[i] else loss.pixel)
-            if inside != is_inlier[i]:
-                is_inlier[i] = inside
-                changed = True
-        if not changed:
+        if not _sort_again(at.chi2, seen.depth, loss, is_inlier):
             break
         cost = normal_equations(T, seen, is_inlier, camera, loss, at)
     for i in range(6):

@@ -140,71 +140,34 @@ class _Limits(NamedTuple):
     ratio: f8
 
 
+class _Ordered(NamedTuple):
+    """`_Seen` in the order of the buckets: what one window needs lies side by side, which takes 0.6 times the time."""
+
+    x: f8[::1]
+    y: f8[::1]
+    octave: i8[::1]
+    desc: u8[:, ::1]
+    row: i4[::1]
+    bucket_start: i4[::1]
+    n_columns: i8  # of buckets
+    n_rows: i8
+
+
 @kernel
 def _search(T_cw: f8[:, ::1], sought: _Sought, seen: _Seen, pinhole: _Pinhole, limits: _Limits):
-    xyz, lm_desc, direction, reach, octave_scale = sought
-    xy, octave, desc, bucket_start, bucket_rows = seen
-    fx, fy, cx, cy, width, height = pinhole
-    radius_px, max_distance, ratio = limits
-    n_lm, n = len(xyz), len(xy)
-    feature = np.full(n_lm, -1, dtype=np.int32)
-    is_visible = np.zeros(n_lm, dtype=np.bool_)
-    owner = np.full(n, -1, dtype=np.int32)
-    owner_distance = np.full(n, 257, dtype=np.int32)
-    columns, rows = -(-width // CELL), -(-height // CELL)
-    centre_x = -(T_cw[0, 0] * T_cw[0, 3] + T_cw[1, 0] * T_cw[1, 3] + T_cw[2, 0] * T_cw[2, 3])
-    centre_y = -(T_cw[0, 1] * T_cw[0, 3] + T_cw[1, 1] * T_cw[1, 3] + T_cw[2, 1] * T_cw[2, 3])
-    centre_z = -(T_cw[0, 2] * T_cw[0, 3] + T_cw[1, 2] * T_cw[1, 3] + T_cw[2, 2] * T_cw[2, 3])
-    # A landmark is looked for in the octave that it should appear in, rounded; two octaves nearer than ever it still counts as octave 0.
-    power, border = np.empty(LAST_OCTAVE + 1), np.empty(LAST_OCTAVE + 4)
-    for step in range(LAST_OCTAVE + 1):
-        power[step] = elementary.whole_power(octave_scale, step)
-    for step in range(LAST_OCTAVE + 4):
-        border[step] = elementary.whole_power(octave_scale, step) / (octave_scale * octave_scale * np.sqrt(octave_scale))
-    # In the order of the buckets, what one window needs lies side by side: 0.6 times the time.
-    sorted_x, sorted_y, sorted_octave, sorted_desc = np.empty(n), np.empty(n), np.empty(n, np.int64), np.empty((n, 4), np.uint64)
-    for position in range(n):
-        j = bucket_rows[position]
-        sorted_x[position], sorted_y[position], sorted_octave[position] = xy[j, 0], xy[j, 1], octave[j]
-        for i in range(4):
-            sorted_desc[position, i] = desc[j, i]
+    """Do what `search` says: a feature that several landmarks choose goes to the one most like it, of equals the first."""
+    n_lm, n = len(sought.xyz), len(seen.xy)
+    feature, is_visible = np.full(n_lm, -1, dtype=np.int32), np.zeros(n_lm, dtype=np.bool_)
+    owner, owner_distance = np.full(n, -1, dtype=np.int32), np.full(n, 257, dtype=np.int32)
+    power, border = _octave_sizes(sought.octave_scale)
+    centre, ordered = _centre(T_cw), _in_bucket_order(seen, pinhole)
     for k in range(n_lm):
-        x, y, z = xyz[k, 0], xyz[k, 1], xyz[k, 2]
-        depth = T_cw[2, 0] * x + T_cw[2, 1] * y + T_cw[2, 2] * z + T_cw[2, 3]
-        if not depth > NEAREST:
+        u, v, octave = _appearance(T_cw, centre, sought, k, pinhole, border)
+        if octave < 0:
             continue
-        u = fx * (T_cw[0, 0] * x + T_cw[0, 1] * y + T_cw[0, 2] * z + T_cw[0, 3]) / depth + cx
-        v = fy * (T_cw[1, 0] * x + T_cw[1, 1] * y + T_cw[1, 2] * z + T_cw[1, 3]) / depth + cy
-        if u < 0.0 or v < 0.0 or u >= width or v >= height:
-            continue
-        dx, dy, dz = x - centre_x, y - centre_y, z - centre_z
-        distance = np.sqrt(dx * dx + dy * dy + dz * dz)
-        if dx * direction[k, 0] + dy * direction[k, 1] + dz * direction[k, 2] < 0.5 * distance:
-            continue  # seen from more than 60 degrees aside a patch looks different
-        share, level = reach[k] / distance, 0
-        if not border[0] <= share <= border[LAST_OCTAVE + 3]:
-            continue  # much nearer or farther than it was ever seen
-        while share > border[level + 3]:
-            level += 1
         is_visible[k] = True
-        radius = radius_px * power[level]
-        best, second, best_row, best_octave, second_octave = 257, 257, -1, -1, -1
-        column_to = min(int((u + radius) / CELL), columns - 1)
-        column_from = min(int(max(u - radius, 0.0) / CELL), columns - 1)
-        row_to = min(int((v + radius) / CELL), rows - 1)
-        for row in range(min(int(max(v - radius, 0.0) / CELL), rows - 1), row_to + 1):
-            for position in range(bucket_start[row * columns + column_from], bucket_start[row * columns + column_to + 1]):
-                o = sorted_octave[position]
-                is_outside = (abs(sorted_x[position] - u) > radius) | (abs(sorted_y[position] - v) > radius)
-                if is_outside | (o < level - 1) | (o > level + 1):
-                    continue
-                bits = int(hamming(lm_desc, k, sorted_desc, position))
-                if bits < best:
-                    second, second_octave = best, best_octave
-                    best, best_octave, best_row = bits, o, bucket_rows[position]
-                elif bits < second:
-                    second, second_octave = bits, o
-        if best > max_distance or (best_octave == second_octave and best > ratio * second):
+        best_row, best, second, is_rivalled = _most_alike(sought.desc, k, ordered, u, v, limits.radius_px * power[octave], octave)
+        if best > limits.max_distance or (is_rivalled and best > limits.ratio * second):
             continue
         if best >= owner_distance[best_row]:
             continue
@@ -213,3 +176,91 @@ def _search(T_cw: f8[:, ::1], sought: _Sought, seen: _Seen, pinhole: _Pinhole, l
         owner[best_row], owner_distance[best_row] = k, best
         feature[k] = best_row
     return feature, is_visible
+
+
+@kernel
+def _octave_sizes(octave_scale):
+    """Return the sizes of octaves, and the borders between shares of a landmark's reach that belong to one.
+
+    A landmark is looked for in the octave that it should appear in, rounded; two octaves nearer than ever it still counts as octave 0.
+    """
+    power, border = np.empty(LAST_OCTAVE + 1), np.empty(LAST_OCTAVE + 4)
+    for step in range(LAST_OCTAVE + 1):
+        power[step] = elementary.whole_power(octave_scale, step)
+    for step in range(LAST_OCTAVE + 4):
+        border[step] = elementary.whole_power(octave_scale, step) / (octave_scale * octave_scale * np.sqrt(octave_scale))
+    return power, border
+
+
+@kernel
+def _centre(T_cw):
+    """Return where the camera is in the world."""
+    return (
+        -(T_cw[0, 0] * T_cw[0, 3] + T_cw[1, 0] * T_cw[1, 3] + T_cw[2, 0] * T_cw[2, 3]),
+        -(T_cw[0, 1] * T_cw[0, 3] + T_cw[1, 1] * T_cw[1, 3] + T_cw[2, 1] * T_cw[2, 3]),
+        -(T_cw[0, 2] * T_cw[0, 3] + T_cw[1, 2] * T_cw[1, 3] + T_cw[2, 2] * T_cw[2, 3]),
+    )
+
+
+@kernel
+def _in_bucket_order(seen, pinhole):
+    xy, octave, desc, bucket_start, bucket_rows = seen
+    n = len(xy)
+    sorted_x, sorted_y, sorted_octave, sorted_desc = np.empty(n), np.empty(n), np.empty(n, np.int64), np.empty((n, 4), np.uint64)
+    for position in range(n):
+        j = bucket_rows[position]
+        sorted_x[position], sorted_y[position], sorted_octave[position] = xy[j, 0], xy[j, 1], octave[j]
+        for i in range(4):
+            sorted_desc[position, i] = desc[j, i]
+    n_columns, n_rows = -(-pinhole.width // CELL), -(-pinhole.height // CELL)
+    return _Ordered(sorted_x, sorted_y, sorted_octave, sorted_desc, bucket_rows, bucket_start, n_columns, n_rows)
+
+
+@kernel
+def _appearance(T_cw, centre, sought, k, pinhole, border):
+    """Return where in the image landmark k should be seen, and in which octave; -1 where it should not."""
+    fx, fy, cx, cy, width, height = pinhole
+    x, y, z = sought.xyz[k, 0], sought.xyz[k, 1], sought.xyz[k, 2]
+    depth = T_cw[2, 0] * x + T_cw[2, 1] * y + T_cw[2, 2] * z + T_cw[2, 3]
+    if not depth > NEAREST:
+        return 0.0, 0.0, -1
+    u = fx * (T_cw[0, 0] * x + T_cw[0, 1] * y + T_cw[0, 2] * z + T_cw[0, 3]) / depth + cx
+    v = fy * (T_cw[1, 0] * x + T_cw[1, 1] * y + T_cw[1, 2] * z + T_cw[1, 3]) / depth + cy
+    if u < 0.0 or v < 0.0 or u >= width or v >= height:
+        return u, v, -1
+    dx, dy, dz = x - centre[0], y - centre[1], z - centre[2]
+    distance = np.sqrt(dx * dx + dy * dy + dz * dz)
+    if dx * sought.direction[k, 0] + dy * sought.direction[k, 1] + dz * sought.direction[k, 2] < 0.5 * distance:
+        return u, v, -1  # seen from more than 60 degrees aside a patch looks different
+    share, octave = sought.reach[k] / distance, 0
+    if not border[0] <= share <= border[LAST_OCTAVE + 3]:
+        return u, v, -1  # much nearer or farther than it was ever seen
+    while share > border[octave + 3]:
+        octave += 1
+    return u, v, octave
+
+
+@kernel
+def _most_alike(lm_desc, k, ordered, u, v, radius, octave):
+    """Find the feature most like landmark k within `radius` of (u, v) and one octave.
+
+    Returns its row, -1 = none, its distance [bits], that of the second best, and whether these two are of one octave.
+    """
+    best, second, best_row, best_octave, second_octave = 257, 257, -1, -1, -1
+    column_to = min(int((u + radius) / CELL), ordered.n_columns - 1)
+    column_from = min(int(max(u - radius, 0.0) / CELL), ordered.n_columns - 1)
+    row_to = min(int((v + radius) / CELL), ordered.n_rows - 1)
+    for row in range(min(int(max(v - radius, 0.0) / CELL), ordered.n_rows - 1), row_to + 1):
+        first = row * ordered.n_columns
+        for position in range(ordered.bucket_start[first + column_from], ordered.bucket_start[first + column_to + 1]):
+            o = ordered.octave[position]
+            is_outside = (abs(ordered.x[position] - u) > radius) | (abs(ordered.y[position] - v) > radius)
+            if is_outside | (o < octave - 1) | (o > octave + 1):
+                continue
+            bits = int(hamming(lm_desc, k, ordered.desc, position))
+            if bits < best:
+                second, second_octave = best, best_octave
+                best, best_octave, best_row = bits, o, ordered.row[position]
+            elif bits < second:
+                second, second_octave = bits, o
+    return best_row, best, second, best_octave == second_octave

@@ -112,7 +112,6 @@ def _draw(placed: _Placed, parts: _Parts, pictures: _Pictures, pinhole: f8[::1],
     """Draw parts into the images, whose depth is the room's. Each pixel is sampled once for depth and four times for colour."""
     T_pc, centre, R_lp = placed
     half, kind, part_owner = parts
-    level, size, start, pixel, texel = pictures
     rgb, depth, cosine, owner = images
     rows, columns = depth.shape
     n_samples = len(samples)
@@ -124,16 +123,7 @@ def _draw(placed: _Placed, parts: _Parts, pictures: _Pictures, pinhole: f8[::1],
     hit = np.zeros((n_samples, rows, columns), np.bool_)
     for p in range(len(half)):
         reach = np.sqrt(half[p, 0] ** 2 + half[p, 1] ** 2 + half[p, 2] ** 2) if kind[p] == 1 else max(half[p, 0], half[p, 1], half[p, 2])
-        x, y, far = centre[p, 0], centre[p, 1], centre[p, 2] + reach
-        near = centre[p, 2] - reach
-        if far < 0.05:
-            continue
-        left, right, top, bottom = 0, columns - 1, 0, rows - 1
-        if near > 0.05:
-            left = max(left, int(np.floor(cx + fx * min((x - reach) / near, (x - reach) / far) - 1)))
-            right = min(right, int(np.ceil(cx + fx * max((x + reach) / near, (x + reach) / far) + 1)))
-            top = max(top, int(np.floor(cy + fy * min((y - reach) / near, (y - reach) / far) - 1)))
-            bottom = min(bottom, int(np.ceil(cy + fy * max((y + reach) / near, (y + reach) / far) + 1)))
+        left, right, top, bottom = _window(centre[p], reach, pinhole, rows, columns)
         T, R, h = T_pc[p], R_lp[p], half[p]
         ox, oy, oz = T[0, 3] / h[0], T[1, 3] / h[1], T[2, 3] / h[2]
         for row in range(top, bottom + 1):
@@ -159,17 +149,8 @@ def _draw(placed: _Placed, parts: _Parts, pictures: _Pictures, pinhole: f8[::1],
                         continue
                     up = R[2, 0] * nx + R[2, 1] * ny + R[2, 2] * nz
                     light = np.float32(0.5 + 0.22 * (1.0 + up) + 0.16 * facing)  # lamps above, walls around
-                    detail = np.log2(max(t / fx / max(facing, 0.2) / texel, 1.0))
-                    m = min(level[p] + int(detail + 0.5), level[p + 1] - 1)
-                    n_rows, n_columns = size[m, 0], size[m, 1]
-                    su, sv = min(max(u * n_columns - 0.5, 0.0), n_columns - 1.001), min(max(v * n_rows - 0.5, 0.0), n_rows - 1.001)
-                    iu, iv = int(su), int(sv)
-                    fu, fv = np.float32(su - iu), np.float32(sv - iv)
-                    at = start[m] + iv * n_columns + iu
-                    for k in range(3):
-                        upper = pixel[at, k] * (1 - fu) + pixel[at + 1, k] * fu
-                        lower = pixel[at + n_columns, k] * (1 - fu) + pixel[at + n_columns + 1, k] * fu
-                        colour[s, row, column, k] = light * (upper * (1 - fv) + lower * fv)
+                    detail = np.log2(max(t / fx / max(facing, 0.2) / pictures.texel, 1.0))
+                    _paint_sample(pictures, p, detail, u, v, light, colour[s, row, column])
     share = np.float32(1.0 / (n_samples - 1))
     for row in range(rows):
         for column in range(columns):
@@ -179,6 +160,38 @@ def _draw(placed: _Placed, parts: _Parts, pictures: _Pictures, pinhole: f8[::1],
                 for s in range(1, n_samples):
                     total += colour[s, row, column, k] if hit[s, row, column] else own
                 rgb[row, column, k] = share * total
+
+
+@kernel
+def _window(centre, reach, pinhole, rows, columns):
+    """Return the first and last column and row in which what reaches so far around its centre may be seen; behind the camera none."""
+    fx, fy, cx, cy = pinhole
+    x, y, near, far = centre[0], centre[1], centre[2] - reach, centre[2] + reach
+    if far < 0.05:
+        return 0, -1, 0, -1
+    left, right, top, bottom = 0, columns - 1, 0, rows - 1
+    if near > 0.05:
+        left = max(left, int(np.floor(cx + fx * min((x - reach) / near, (x - reach) / far) - 1)))
+        right = min(right, int(np.ceil(cx + fx * max((x + reach) / near, (x + reach) / far) + 1)))
+        top = max(top, int(np.floor(cy + fy * min((y - reach) / near, (y - reach) / far) - 1)))
+        bottom = min(bottom, int(np.ceil(cy + fy * max((y + reach) / near, (y + reach) / far) + 1)))
+    return left, right, top, bottom
+
+
+@kernel
+def _paint_sample(pictures, p, detail, u, v, light, out):
+    """Write the colour (3,) of part p's picture at shares u, v of its width and height, in the size that shows so much detail."""
+    level, size, start, pixel, _ = pictures
+    m = min(level[p] + int(detail + 0.5), level[p + 1] - 1)
+    n_rows, n_columns = size[m, 0], size[m, 1]
+    su, sv = min(max(u * n_columns - 0.5, 0.0), n_columns - 1.001), min(max(v * n_rows - 0.5, 0.0), n_rows - 1.001)
+    iu, iv = int(su), int(sv)
+    fu, fv = np.float32(su - iu), np.float32(sv - iv)
+    at = start[m] + iv * n_columns + iu
+    for k in range(3):
+        upper = pixel[at, k] * (1 - fu) + pixel[at + 1, k] * fu
+        lower = pixel[at + n_columns, k] * (1 - fu) + pixel[at + n_columns + 1, k] * fu
+        out[k] = light * (upper * (1 - fv) + lower * fv)
 
 
 @kernel

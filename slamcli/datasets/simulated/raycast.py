@@ -167,26 +167,13 @@ def _shade_kernel(rays, seen, pixel, atlas):
     depth = np.empty(len(rays), np.float32)
     cosine = np.empty(len(rays), np.float32)
     one = np.float32(1.0)
-    pixel_x, pixel_y = pixel
-    plane_c, to_u_c, to_v_c, level, size, start, texel = atlas
+    plane_c, _, _, level, size, start, texel = atlas
     for i in range(len(rays)):
         q, x, y = seen[i], rays[i, 0], rays[i, 1]
         slope = plane_c[q, 0] * x + plane_c[q, 1] * y + plane_c[q, 2]
-        t = -plane_c[q, 3] / slope
-        depth[i] = t
+        depth[i] = -plane_c[q, 3] / slope
         cosine[i] = abs(slope) / np.sqrt(x * x + y * y + 1.0)
-        du = to_u_c[q, 0] * x + to_u_c[q, 1] * y + to_u_c[q, 2]
-        dv = to_v_c[q, 0] * x + to_v_c[q, 1] * y + to_v_c[q, 2]
-        u, v = to_u_c[q, 3] + t * du, to_v_c[q, 3] + t * dv
-        # A step of the ray by one pixel moves the point within its plane: t changes by -t (n . step) / (n . d).
-        n_x, n_y = plane_c[q, 0] / slope, plane_c[q, 1] / slope
-        ux, vx = t * pixel_x * (to_u_c[q, 0] - du * n_x), t * pixel_x * (to_v_c[q, 0] - dv * n_x)
-        uy, vy = t * pixel_y * (to_u_c[q, 1] - du * n_y), t * pixel_y * (to_v_c[q, 1] - dv * n_y)
-        lu, lv, length = ux, vx, np.sqrt(ux * ux + vx * vx)
-        other = np.sqrt(uy * uy + vy * vy)
-        if other > length:
-            lu, lv, length = uy, vy, other
-        width = max(abs(ux * vy - uy * vx) / max(length, 1e-12), 1e-12)
+        u, v, lu, lv, length, width = _footprint(atlas, q, x, y, pixel)
         taps = int(min(max(np.ceil(length / max(width, 1.0)), 1.0), MAX_TAPS))
         detail = np.log2(max(width, length / taps, 1.0))
         first, last = level[q], level[q + 1] - 1
@@ -208,19 +195,42 @@ def _shade_kernel(rays, seen, pixel, atlas):
                 w00, w01 = weight * (one - fu) * (one - fv), weight * fu * (one - fv)
                 w10, w11 = weight * (one - fu) * fv, weight * fu * fv
                 p = begin + iv * columns + iu
-                a, c, e, f = texel[p], texel[p + right], texel[p + below], texel[p + below + right]
-                r += w00 * np.float32(a & 255) + w01 * np.float32(c & 255) + w10 * np.float32(e & 255) + w11 * np.float32(f & 255)
-                g += (
-                    w00 * np.float32((a >> 8) & 255)
-                    + w01 * np.float32((c >> 8) & 255)
-                    + w10 * np.float32((e >> 8) & 255)
-                    + w11 * np.float32((f >> 8) & 255)
-                )
-                b += (
-                    w00 * np.float32((a >> 16) & 255)
-                    + w01 * np.float32((c >> 16) & 255)
-                    + w10 * np.float32((e >> 16) & 255)
-                    + w11 * np.float32((f >> 16) & 255)
-                )
+                square, weights = (texel[p], texel[p + right], texel[p + below], texel[p + below + right]), (w00, w01, w10, w11)
+                r += _weighted(square, weights, 0)
+                g += _weighted(square, weights, 8)
+                b += _weighted(square, weights, 16)
         rgb[i, 0], rgb[i, 1], rgb[i, 2] = r, g, b
     return rgb, depth, cosine
+
+
+@kernel
+def _footprint(atlas, q, x, y, pixel):
+    """Return where a ray (x, y) meets picture q, and the pixel's footprint there: its longer side (u, v), that side's length, its width [texels]."""
+    plane_c, to_u_c, to_v_c, _, _, _, _ = atlas
+    slope = plane_c[q, 0] * x + plane_c[q, 1] * y + plane_c[q, 2]
+    t = -plane_c[q, 3] / slope
+    du = to_u_c[q, 0] * x + to_u_c[q, 1] * y + to_u_c[q, 2]
+    dv = to_v_c[q, 0] * x + to_v_c[q, 1] * y + to_v_c[q, 2]
+    u, v = to_u_c[q, 3] + t * du, to_v_c[q, 3] + t * dv
+    # A step of the ray by one pixel moves the point within its plane: t changes by -t (n . step) / (n . d).
+    n_x, n_y = plane_c[q, 0] / slope, plane_c[q, 1] / slope
+    ux, vx = t * pixel[0] * (to_u_c[q, 0] - du * n_x), t * pixel[0] * (to_v_c[q, 0] - dv * n_x)
+    uy, vy = t * pixel[1] * (to_u_c[q, 1] - du * n_y), t * pixel[1] * (to_v_c[q, 1] - dv * n_y)
+    lu, lv, length = ux, vx, np.sqrt(ux * ux + vx * vx)
+    other = np.sqrt(uy * uy + vy * vy)
+    if other > length:
+        lu, lv, length = uy, vy, other
+    return u, v, lu, lv, length, max(abs(ux * vy - uy * vx) / max(length, 1e-12), 1e-12)
+
+
+@kernel
+def _weighted(square, weights, shift):
+    """Return the weighted sum of one colour of four texels, the one that begins at bit `shift`."""
+    a, c, e, f = square
+    w00, w01, w10, w11 = weights
+    return (
+        w00 * np.float32((a >> shift) & 255)
+        + w01 * np.float32((c >> shift) & 255)
+        + w10 * np.float32((e >> shift) & 255)
+        + w11 * np.float32((f >> shift) & 255)
+    )
