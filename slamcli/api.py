@@ -10,8 +10,7 @@ Nothing is printed: progress goes to the `progress` of the caller, single lines 
 import copy
 import logging
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -21,10 +20,11 @@ from typing import TYPE_CHECKING, Any, Literal
 from slamcli.config import toml
 from slamcli.config.options import Config
 from slamcli.config.toml import Settings
-from slamcli.console import Progress, Tell, log_file, silent
+from slamcli.console import Progress, Tell, silent
 from slamcli.errors import SlamError
-from slamcli.runs.run_directory import RunDir, default_path
-from slamcli.runs.several import entries, extend, joined, pipeline
+from slamcli.runs.creation import create_run, open_target, writing
+from slamcli.runs.run_directory import RunDir
+from slamcli.runs.several import extend, pipeline
 from slamcli.runs.staleness import State
 from slamcli.stages import NAMES
 
@@ -163,7 +163,7 @@ class Run:
         """
         self.directory.restore()
         config = self.config()
-        datasets = [_opened(str(target), config, data, progress) for target in targets]
+        datasets = [open_target(str(target), config, data, progress) for target in targets]
         looked = {str(dataset.root.resolve()): look(dataset) for dataset in datasets} if look is not None else {}
         with writing(self.directory, config):
             self.directory.mark_latest()
@@ -315,68 +315,11 @@ def _told_by_map(camera: "DepthCamera", dataset: "Dataset", config: Config) -> "
     seconds = float(dataset.stamp[min(len(dataset), TRIAL_FRAMES) - 1] - dataset.stamp[0])
     beginning = replace(config.recording, depth_camera=camera.option, end=config.recording.start + max(seconds, LEAST_TRIAL))
     config = replace(config, recording=beginning)
-    evidence = trial.registration_evidence(_opened(str(dataset.root), config, None, silent), config, camera.registration(dataset.camera))
+    evidence = trial.registration_evidence(
+        open_target(str(dataset.root), config, None, silent), config, camera.registration(dataset.camera)
+    )
     better = camera.told_by(evidence) if evidence is not None else camera
     return better if better.is_sure else camera
-
-
-def create_run(
-    targets: Sequence[str],
-    *,
-    resolve: Callable[[Config | None], Config],
-    path: str | os.PathLike[str] | None = None,
-    data: str | None = None,
-    progress: Progress = silent,
-    opened: "Callable[[str, Config], Dataset | None]" = lambda target, config: None,
-) -> "tuple[RunDir, Dataset, Config]":
-    """Open the recording, or several that are to have one map, and make their run, or open the run that is there.
-
-    resolve : gives the configuration under which to run, from the run's own; None where there is no run yet
-    opened : gives a recording that the caller has opened already under a configuration, or None
-
-    No stage is run and no configuration written. Raises SlamError where several are given, but no `path`.
-    """
-    if not targets:
-        raise SlamError("no recording named; give a folder, tum/fr1_room or demo")
-    if len(targets) > 1 and path is None:
-        raise SlamError(
-            "several recordings make one map, whose run needs a name, such as -r runs/house; for a run of each: slamcli batch RECORDING..."
-        )
-
-    def open_all(config: Config) -> "list[Dataset]":
-        return [opened(target, config) or _opened(target, config, data, progress) for target in targets]
-
-    if path is not None:
-        RunDir(Path(path)).restore()
-    first = resolve(RunDir(Path(path)).config() if path is not None else None)
-    datasets = open_all(first)
-    place = Path(path) if path is not None else default_path(datasets[0].name)
-    RunDir(place).restore()
-    config = resolve(RunDir(place).config())
-    if (config.camera, config.recording) != (first.camera, first.recording):  # an earlier command gave this run others
-        datasets = open_all(config)
-    if len(datasets) > 1:
-        return *_create_of_several(place, datasets), config
-    (dataset,) = datasets
-    directory = RunDir.create(place, dataset=dataset.name, root=str(dataset.root.resolve()), digest=dataset.digest())
-    return directory, dataset, config
-
-
-def _opened(target: str, config: Config, data: str | None, progress: Progress) -> "Dataset":
-    from slamcli.datasets import open_dataset
-
-    return open_dataset(target, data=data, camera=dict(config.camera) or None, options=config.recording, progress=progress)
-
-
-def _create_of_several(place: Path, datasets: "Sequence[Dataset]") -> "tuple[RunDir, Dataset]":
-    """Make the run of several recordings; in a run of the same that is there they keep their order and their names."""
-    found = entries(datasets)
-    roots = {entry["root"]: entry for entry in found}
-    there = RunDir(place).recordings if (place / "run.json").is_file() else []
-    if {entry["root"] for entry in there} == roots.keys():
-        found = [{**entry, "digest": roots[entry["root"]]["digest"]} for entry in there]
-    dataset = joined(found, datasets)
-    return RunDir.create(place, dataset=dataset.name, root=str(dataset.root), digest=dataset.digest(), recordings=found), dataset
 
 
 def _bring_up_to_date(
@@ -394,11 +337,3 @@ def _bring_up_to_date(
         stages = pipeline(directory, config, dataset=dataset, progress=progress, tell=tell)
         stages.keep_looks(looked)
         stages.bring_up_to_date(**which)
-
-
-@contextmanager
-def writing(directory: RunDir, config: Config, *, wait: bool = False) -> Iterator[None]:
-    """Lock the run, log to its file, and make `config` its configuration; `wait` for another process that holds it."""
-    with directory.lock(wait=wait), log_file(directory.path / "log.txt"):
-        directory.write_config(config)
-        yield

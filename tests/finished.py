@@ -13,7 +13,8 @@ from slamcli.formats.cloud import write_ply
 from slamcli.formats.trajectory import write_tum
 from slamcli.geometry import se3
 from slamcli.runs import pipeline, source_code, staleness
-from slamcli.runs.run_directory import RunDir, outputs
+from slamcli.runs.damage import outputs
+from slamcli.runs.run_directory import RunDir
 from slamcli.schema import FORMAT, Closures, Doubt, Features, FrameTimes, Ground, Map, Moving, Timing, Tracks, Trajectory, trajectory
 from slamcli.stages import STAGES
 

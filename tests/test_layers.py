@@ -1,4 +1,4 @@
-"""The rules of import, of what a compiled kernel may call, and of arguments. Read from the source text: nothing is imported for it."""
+"""The rules of import, of what a compiled kernel may call, and of size. Read from the source text: nothing is imported for it."""
 
 import ast
 import re
@@ -198,6 +198,14 @@ def test_what_a_run_writes_does_not_follow_the_processor(path: Path) -> None:
     products = [ast.unparse(node) for node in ast.walk(tree) if isinstance(node, ast.BinOp) and isinstance(node.op, ast.MatMult)]
     known = SPARSE.get(name_of(path), [])
     assert not [text for text in products if not any(text in allowed for allowed in known)]
+
+
+MOST_LINES = 400  # of a file, which has one subject
+
+
+@pytest.mark.parametrize("path", MODULES, ids=name_of)
+def test_a_file_is_short_enough_for_one_subject(path: Path) -> None:
+    assert len(path.read_text(encoding="utf-8").splitlines()) <= MOST_LINES
 
 
 # What belongs together travels together: as a record, whose fields say what each thing is.

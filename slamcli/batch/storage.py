@@ -12,7 +12,8 @@ from typing import Any
 
 from slamcli import files
 from slamcli.errors import SlamError
-from slamcli.runs.run_directory import RunDir, outputs
+from slamcli.runs.damage import outputs
+from slamcli.runs.run_directory import RunDir
 from slamcli.stages import NAMES
 
 HINTS = {"s3": "s3fs", "gs": "gcsfs", "gcs": "gcsfs", "sftp": "paramiko", "ssh": "paramiko", "abfs": "adlfs"}  # what fsspec needs for each

@@ -14,7 +14,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from slamcli import __version__, api
+from slamcli import __version__
 from slamcli.batch import storage
 from slamcli.batch.jobs import Job
 from slamcli.config import toml
@@ -25,6 +25,7 @@ from slamcli.jit import compilation
 from slamcli.parallel import one_thread_in_blas
 from slamcli.runs import source_code
 from slamcli.runs.cost_meter import Meter
+from slamcli.runs.creation import create_run, writing
 from slamcli.runs.pipeline import Begun, Pipeline, environment
 from slamcli.runs.run_directory import RunDir
 from slamcli.stages import extract, stage_named
@@ -173,12 +174,12 @@ class Desk:
         """Bring the run up to date as far as `stage`, in general that stage alone."""
         target, order = self.open(stage), self.job.order
         logging.getLogger("slamcli").setLevel(logging.DEBUG)  # a run's log.txt has everything, here as from the command line
-        directory, dataset, config = api.create_run(
+        directory, dataset, config = create_run(
             [target], resolve=self._resolve, path=self.directory.path, data=order.data, opened=partial(_last.recording_of, self.job)
         )
         _last.keep(self.job, config, dataset)
         # Another process may still be at it for a client that has died since: what it makes is then found up to date.
-        with api.writing(directory, config, wait=True):
+        with writing(directory, config, wait=True):
             before = _written(directory, stage)
             threads = replace(config, run=replace(config.run, workers=order.threads))
             pipeline = Pipeline(directory, threads, dataset=dataset)

@@ -89,7 +89,7 @@ def _order(out: str, config_name: str | None, assignments: tuple[str, ...], data
     from slamcli.batch.jobs import Order, absolute_out
     from slamcli.batch.storage import is_url
     from slamcli.config import toml
-    from slamcli.runs.run_directory import refuse_inside
+    from slamcli.runs.places import refuse_inside
 
     out = absolute_out(out)
     if not is_url(out):

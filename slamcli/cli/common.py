@@ -137,7 +137,7 @@ class Target(click.Path):
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
         """Refuse a place in a run directory before any work is done."""
-        from slamcli.runs.run_directory import refuse_inside
+        from slamcli.runs.places import refuse_inside
 
         path = Path(os.fsdecode(super().convert(value, param, ctx)))
         refuse_inside(path, own=self.own)

@@ -195,7 +195,7 @@ def _open_runs(runs: tuple[str, ...], run: str | None) -> list[RunDir]:
 
 def _label(folder: RunDir) -> str:
     """Name a run in a table: its place below runs/, which tells two runs of one recording apart."""
-    from slamcli.runs.run_directory import RUNS
+    from slamcli.runs.places import RUNS
 
     path = folder.path.resolve()
     return path.relative_to(RUNS.resolve()).as_posix() if path.is_relative_to(RUNS.resolve()) else path.name

@@ -265,7 +265,8 @@ def config_command(
     """
     from slamcli.config import toml
     from slamcli.config.options import Config
-    from slamcli.runs.run_directory import LATEST, RunDir
+    from slamcli.runs.places import LATEST
+    from slamcli.runs.run_directory import RunDir
 
     has_run = run or os.environ.get("SLAMCLI_RUN") or LATEST.exists()
     base = RunDir.find(run).config() if has_run and not defaults else Config()

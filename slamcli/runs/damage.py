@@ -47,6 +47,16 @@ def is_record(record: Mapping[str, Any]) -> bool:
     return all(isinstance(e, dict) and isinstance(e.get("bytes"), int) and isinstance(e.get("sha256"), str) for e in entries)
 
 
+def outputs(folder: Path) -> dict[str, dict[str, Any]]:
+    """List a stage's files with size and digest, by name."""
+    found = {path: path.stat() for path in sorted(folder.rglob("*")) if path.name != "stage.json"}
+    return {
+        path.relative_to(folder).as_posix(): {"bytes": status.st_size, "sha256": sha256(path, status)}
+        for path, status in found.items()
+        if stat.S_ISREG(status.st_mode)
+    }
+
+
 def find(folder: Path, outputs: Mapping[str, Any], names: Iterable[str], *, verify: bool) -> str:
     """Say what is wrong with files of a stage's folder, or "": each has its recorded size and, with `verify`, its recorded digest."""
     home = os.fspath(folder)

@@ -10,7 +10,8 @@ from typing import Any
 
 from slamcli import files
 from slamcli.errors import Damaged, SlamError
-from slamcli.runs.run_directory import LATEST, RECORDINGS, RUNS, RunDir
+from slamcli.runs.places import LATEST, RECORDINGS, RUNS
+from slamcli.runs.run_directory import RunDir
 from slamcli.stages import NAMES
 
 DEEPEST = 3  # folders below runs/ in which runs are looked for: runs/tum/fr1_room is the deepest that slamcli makes by itself

@@ -19,7 +19,7 @@ from slamcli.console import Progress, Tell, silent, stage_line
 from slamcli.errors import SlamError
 from slamcli.jit import compilation
 from slamcli.parallel import one_thread_in_blas
-from slamcli.runs import run_directory, source_code, staleness
+from slamcli.runs import damage, source_code, staleness
 from slamcli.runs.cost_meter import Meter, return_free_memory
 from slamcli.runs.run_directory import RunDir
 from slamcli.runs.staleness import State
@@ -259,7 +259,7 @@ class Pipeline:
                 raise interruption.Interrupted(found.number, f" in {stage.name}; earlier stages are kept") from None
             if begun is not None:
                 meter.add(seconds=begun.seconds, cpu_seconds=begun.cpu_seconds, peak_rss_mb=begun.peak_rss_mb)
-            record = self._record(stage, inputs, run_directory.outputs(out), meter, tools, summary)
+            record = self._record(stage, inputs, damage.outputs(out), meter, tools, summary)
             self.run.commit(stage.name, out, record)
         log.debug("%s", record)
         self._tell(stage_line(record))

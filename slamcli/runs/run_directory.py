@@ -1,16 +1,14 @@
-"""The run directory: which one is meant, who may write to it, what a finished stage leaves, and whether that is still whole.
+"""The run directory: what belongs to the whole run, what a finished stage leaves, and whether that is still whole.
 
 A stage writes to ``.<stage>.<pid>/``; its record comes last, then one rename puts the folder in place. So a stage's folder is complete
 or absent, whatever kills the program.
 """
 
 import contextlib
-import fcntl
 import logging
 import os
 import shlex
 import shutil
-import stat
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import UTC, datetime
@@ -21,7 +19,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from slamcli import files
 from slamcli.config.options import Config
 from slamcli.errors import Damaged, SlamError
-from slamcli.runs import damage, source_code, staleness
+from slamcli.runs import damage, places, run_lock, source_code, staleness
+from slamcli.runs.places import RECORDINGS
 from slamcli.runs.staleness import State
 from slamcli.schema import FORMAT
 from slamcli.stages import NAMES, STAGES, basis
@@ -33,10 +32,7 @@ if TYPE_CHECKING:
 Record = TypeVar("Record")
 log = logging.getLogger(__name__)
 
-RUNS = Path("runs")
-LATEST = RUNS / "latest"
 FIGURES = ("eval/*.json", "inspection.json")  # what eval and report keep of their findings, each file sealed
-RECORDINGS = "recordings"  # folder of the runs of single recordings inside a run of several
 
 
 class RunDir:
@@ -55,18 +51,10 @@ class RunDir:
 
         restore : where the run's own files are damaged, restore them first
         """
-        named = run or os.environ.get("SLAMCLI_RUN")
-        path = Path(named) if named else LATEST
-        if named and not _is_run(path) and _is_run(RUNS / named):
-            path = RUNS / named
-        if _is_run(path):
-            found = cls(path if named else Path(os.path.relpath(path.resolve())))
-            if restore:
-                found.restore()
-            return found._checked()
-        if named:
-            raise SlamError(f"{path}: not a run directory (it has no run.json); make one with: slamcli run TARGET -r {path}")
-        raise SlamError("no run here yet (runs/latest leads nowhere); make one with: slamcli run demo, or name one with -r")
+        found = cls(places.find(run))
+        if restore:
+            found.restore()
+        return found._checked()
 
     @classmethod
     def create(cls, path: Path, *, dataset: str, root: str, digest: str, recordings: Sequence[Mapping[str, str]] = ()) -> "RunDir":
@@ -78,11 +66,11 @@ class RunDir:
         about: dict[str, Any] = {"dataset": dataset, "root": root, "digest": digest}
         if recordings:
             about["recordings"] = [dict(entry) for entry in recordings]
-        if not _is_run(run.path):
+        if not places.is_run(run.path):
             if run.path.is_dir() and any(not entry.name.startswith(".") for entry in run.path.iterdir()):
                 raise SlamError(f"{path}: the folder is not empty and not a run directory; name another with -r")
             if run.path.parent.name != RECORDINGS:  # where a run of several has those of each
-                refuse_inside(run.path)
+                places.refuse_inside(run.path)
             run.path.mkdir(parents=True, exist_ok=True)
             run._write_info(about)
             return run
@@ -109,14 +97,7 @@ class RunDir:
 
     def mark_latest(self) -> None:
         """Point ``runs/latest`` here. A current folder that cannot be written to only means that there is no such link."""
-        try:
-            RUNS.mkdir(exist_ok=True)
-            link = RUNS / ".latest.part"
-            link.unlink(missing_ok=True)
-            link.symlink_to(os.path.relpath(self.path.resolve(), RUNS.resolve()))
-            os.replace(link, LATEST)
-        except OSError as error:
-            log.debug("no runs/latest: %s", error)
+        places.mark_latest(self.path)
 
     # what belongs to the whole run
 
@@ -173,7 +154,7 @@ class RunDir:
 
     def restore(self) -> None:
         """Write ``run.json`` and ``config.toml`` anew where they are damaged, from what the finished stages recorded; drop damaged findings."""
-        is_run = _has_stage(self.path) or ((self.path / ".lock").is_file() and (self.path / "run.json").exists())
+        is_run = places.has_stage(self.path) or ((self.path / ".lock").is_file() and (self.path / "run.json").exists())
         lacking = [name for name in ("run.json", "config.toml") if is_run and not self._is_sealed(name)]
         figures = self.damaged_figures() if is_run else []
         if not lacking and not figures:
@@ -368,33 +349,8 @@ class RunDir:
     @contextmanager
     def lock(self, *, wait: bool = False) -> Iterator[None]:
         """Hold the run for writing; when another process does, wait or raise SlamError. What a killed process left is cleared first."""
-        with files.open_own(self.path / ".lock") as file:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX if wait else fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                file.seek(0)
-                raise SlamError(f"{self.path}: in use by another slamcli (process {file.read(20).strip() or '?'}); wait for it") from None
-            with files.written(self.path / ".lock"):
-                file.truncate(0)
-                os.write(file.fileno(), f"{os.getpid()}\n".encode())
-            self._recover()
+        with run_lock.held(self.path, wait=wait):
             yield
-
-    def _recover(self) -> None:
-        """Clear what dead processes left; the lock is held, so every half-written folder is dead.
-
-        Killed between the two renames of `commit`, the stage's folder is gone and its predecessor lies beside it: it is put back.
-        """
-        for stage in (*NAMES, RECORDINGS):
-            old = self.path / f".{stage}.old"
-            if old.is_dir() and not (self.path / stage).exists():
-                old.rename(self.path / stage)
-            for leftover in self.path.glob(f".{stage}.*"):
-                shutil.rmtree(leftover)
-        for leftover in (self.path / RECORDINGS).glob(".*.part"):
-            shutil.rmtree(leftover)
-        for name in ("run.json", "config.toml"):
-            files.clear_leftover(self.path / name)
 
     @contextmanager
     def writing(self, stage: str) -> Iterator[Path]:
@@ -426,14 +382,6 @@ def open_recording(root: str, config: Config, flag: str) -> "Dataset":
     return open_dataset(root, camera=dict(config.camera) or None, options=config.recording)
 
 
-def default_path(dataset: str) -> Path:
-    """Name the run directory of a recording; SlamError for a name that would not stay under ``runs/``."""
-    parts = Path(dataset).parts
-    if not parts or ".." in parts or Path(dataset).is_absolute() or dataset == LATEST.name:
-        raise SlamError(f"no run directory can be named after a recording called {dataset!r}; name one with -r")
-    return RUNS / dataset
-
-
 def _holds_another(path: Path, roots: list[str]) -> str:
     told = f"another recording ({roots[0]})" if len(roots) == 1 else f"other recordings ({', '.join(roots)})"
     return f"{path}: holds a run of {told}; name another folder with -r, or add to that map with: slamcli add {shlex.quote(str(path))} RECORDING"
@@ -444,30 +392,3 @@ def _is_entry(entry: Any) -> bool:
     if not isinstance(entry, dict) or not all(isinstance(entry.get(name), str) for name in ("name", "dataset", "root", "digest")):
         return False
     return bool(entry["name"]) and Path(entry["name"]).name == entry["name"] and not entry["name"].startswith(".")
-
-
-def _is_run(path: Path) -> bool:
-    """Say whether a folder is a run, if need be one that lost its ``run.json``."""
-    return (path / "run.json").is_file() or _has_stage(path)
-
-
-def _has_stage(path: Path) -> bool:
-    return any((path / stage / "stage.json").is_file() for stage in NAMES)
-
-
-def refuse_inside(path: Path, *, own: str = "") -> None:
-    """Raise SlamError where a file or folder to be written lies in a run directory, except by the name `own` in its top folder."""
-    real = Path(os.path.realpath(path))
-    for folder in real.parents:
-        if (folder / "run.json").is_file() and (folder / "config.toml").is_file() and (real.name != own or folder != real.parent):
-            raise SlamError(f"{path}: lies in the run directory {folder}, whose files are the run's own; choose a place outside")
-
-
-def outputs(folder: Path) -> dict[str, dict[str, Any]]:
-    """List a stage's files with size and digest, by name."""
-    found = {path: path.stat() for path in sorted(folder.rglob("*")) if path.name != "stage.json"}
-    return {
-        path.relative_to(folder).as_posix(): {"bytes": status.st_size, "sha256": files.sha256(path, status)}
-        for path, status in found.items()
-        if stat.S_ISREG(status.st_mode)
-    }

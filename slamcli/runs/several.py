@@ -16,7 +16,8 @@ from slamcli.datasets.joined import JoinedDataset, check_different, in_order, un
 from slamcli.datasets.protocol import Dataset
 from slamcli.errors import SlamError
 from slamcli.runs.pipeline import Begun, Pipeline
-from slamcli.runs.run_directory import RECORDINGS, RunDir, open_recording
+from slamcli.runs.places import RECORDINGS
+from slamcli.runs.run_directory import RunDir, open_recording
 from slamcli.slam.doubt import Finding
 from slamcli.stages import NAMES, STAGES, Stage
 from slamcli.stages.joining import JOINS, Part

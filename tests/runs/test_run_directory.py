@@ -12,11 +12,11 @@ import fakes
 import pytest
 
 from slamcli import files
-from slamcli.api import writing
 from slamcli.cli import evaluate
 from slamcli.config.options import Config
 from slamcli.errors import SlamError
-from slamcli.runs import run_directory
+from slamcli.runs import damage, places
+from slamcli.runs.creation import writing
 from slamcli.runs.pipeline import Pipeline
 from slamcli.runs.run_directory import RunDir
 from slamcli.schema import FORMAT
@@ -81,7 +81,7 @@ def test_no_run_and_no_such_run_say_what_to_do(tmp_path: Path, monkeypatch: pyte
 @pytest.mark.parametrize("name", ["", "..", "../x", "/etc", "latest", "a/../../b"])
 def test_no_recording_name_leads_out_of_runs(name: str) -> None:
     with pytest.raises(SlamError, match="name one with -r"):
-        run_directory.default_path(name)
+        places.default_path(name)
 
 
 def test_a_run_belongs_to_one_recording_which_may_move_or_change(tmp_path: Path) -> None:
@@ -293,7 +293,7 @@ def test_outputs_lists_every_file_by_name_in_order(tmp_path: Path) -> None:
     (tmp_path / "sub").mkdir()
     for name in ("b.txt", "a.txt", "sub/c.txt"):
         (tmp_path / name).write_text(name)
-    found = run_directory.outputs(tmp_path)
+    found = damage.outputs(tmp_path)
     assert list(found) == ["a.txt", "b.txt", "sub/c.txt"]
     assert found["sub/c.txt"]["bytes"] == 9
 

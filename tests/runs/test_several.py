@@ -19,6 +19,7 @@ from slamcli.evaluation import trajectory_error
 from slamcli.formats.trajectory import read_tum
 from slamcli.geometry import se3
 from slamcli.runs import several
+from slamcli.runs.creation import create_run
 from slamcli.runs.pipeline import Pipeline
 from slamcli.runs.run_directory import RunDir
 from slamcli.schema import Map, Recordings, Tracks, frame_segments
@@ -95,7 +96,7 @@ def test_the_order_in_which_they_are_named_is_not_the_order_in_which_they_are_jo
 ) -> None:
     for number, names in enumerate(itertools.permutations(recordings)):
         targets = [str(recordings[name]) for name in names]
-        run, dataset, _ = api.create_run(targets, resolve=lambda config: config or Config(), path=tmp_path / str(number))
+        run, dataset, _ = create_run(targets, resolve=lambda config: config or Config(), path=tmp_path / str(number))
         assert {**run.info(), "created": "", "sealed": ""} == {**house.info(), "created": "", "sealed": ""}
         assert dataset.digest() == house.info()["digest"]
 

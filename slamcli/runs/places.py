@@ -1,0 +1,65 @@
+"""Where runs lie: which one is meant, where a new one goes, and what is inside one."""
+
+import logging
+import os
+from pathlib import Path
+
+from slamcli.errors import SlamError
+from slamcli.stages import NAMES
+
+log = logging.getLogger(__name__)
+
+RUNS = Path("runs")
+LATEST = RUNS / "latest"
+RECORDINGS = "recordings"  # folder of the runs of single recordings inside a run of several
+
+
+def find(run: str | None) -> Path:
+    """Return the run a command means: `run` (of -r), a folder or a name under runs/, else $SLAMCLI_RUN, else the one last touched."""
+    named = run or os.environ.get("SLAMCLI_RUN")
+    path = Path(named) if named else LATEST
+    if named and not is_run(path) and is_run(RUNS / named):
+        path = RUNS / named
+    if is_run(path):
+        return path if named else Path(os.path.relpath(path.resolve()))
+    if named:
+        raise SlamError(f"{path}: not a run directory (it has no run.json); make one with: slamcli run TARGET -r {path}")
+    raise SlamError("no run here yet (runs/latest leads nowhere); make one with: slamcli run demo, or name one with -r")
+
+
+def mark_latest(path: Path) -> None:
+    """Point ``runs/latest`` to a run; where the current folder cannot be written to there is no such link."""
+    try:
+        RUNS.mkdir(exist_ok=True)
+        link = RUNS / ".latest.part"
+        link.unlink(missing_ok=True)
+        link.symlink_to(os.path.relpath(path.resolve(), RUNS.resolve()))
+        os.replace(link, LATEST)
+    except OSError as error:
+        log.debug("no runs/latest: %s", error)
+
+
+def default_path(dataset: str) -> Path:
+    """Name the run directory of a recording; SlamError for a name that would not stay under ``runs/``."""
+    parts = Path(dataset).parts
+    if not parts or ".." in parts or Path(dataset).is_absolute() or dataset == LATEST.name:
+        raise SlamError(f"no run directory can be named after a recording called {dataset!r}; name one with -r")
+    return RUNS / dataset
+
+
+def is_run(path: Path) -> bool:
+    """Say whether a folder is a run, if need be one that lost its ``run.json``."""
+    return (path / "run.json").is_file() or has_stage(path)
+
+
+def has_stage(path: Path) -> bool:
+    """Say whether a folder holds a finished stage."""
+    return any((path / stage / "stage.json").is_file() for stage in NAMES)
+
+
+def refuse_inside(path: Path, *, own: str = "") -> None:
+    """Raise SlamError where a file or folder to be written lies in a run directory, except by the name `own` in its top folder."""
+    real = Path(os.path.realpath(path))
+    for folder in real.parents:
+        if (folder / "run.json").is_file() and (folder / "config.toml").is_file() and (real.name != own or folder != real.parent):
+            raise SlamError(f"{path}: lies in the run directory {folder}, whose files are the run's own; choose a place outside")
