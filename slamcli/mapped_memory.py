@@ -20,7 +20,7 @@ from slamcli import files
 
 MOST_RESIDENT = 384 << 20  # bytes of mapped files in memory, a third of which are the libraries
 LEAST_FILE = 64 << 20  # bytes of an array that is worth a file
-AT_ONCE = 16 << 20  # bytes copied before what was read is looked at again
+AT_ONCE = 2 << 20  # bytes made or copied at once: what goes into them takes several times as many
 LOOK = 0.02  # [s] between looks at the resident memory
 
 _CAN_RELEASE = hasattr(mmap, "MADV_DONTNEED")

@@ -1,10 +1,12 @@
 """Progress, tables and the line that tells a finished stage; what a stage costs."""
 
 import ctypes
+import gc
 import io
 import logging
 import sys
 import time
+import weakref
 
 import numpy as np
 import pytest
@@ -119,7 +121,24 @@ def test_free_memory_is_handed_back_or_nothing_happens(monkeypatch: pytest.Monke
     held = [np.ones(64 << 10) for _ in range(200)]  # 100 MB, in pieces that the C library keeps when they are freed between others
     kept, before = held[::2], cost_meter._resident_mb()
     del held
-    cost_meter.return_free_memory()
+    cost_meter.return_free_memory(0.0)
     assert cost_meter._resident_mb() <= before - 25.0 and len(kept) == 100
     monkeypatch.setattr(ctypes, "CDLL", lambda _: object())
-    cost_meter.return_free_memory()
+    cost_meter.return_free_memory(0.0)
+
+
+@pytest.mark.parametrize(("peak_mb", "is_freed"), [(cost_meter.MUCH - 1.0, False), (cost_meter.MUCH + 1.0, True)])
+def test_objects_that_hold_one_another_are_freed_after_a_stage_that_took_much(peak_mb: float, is_freed: bool) -> None:
+    class Node:
+        other: "Node"
+
+    gc.disable()
+    try:
+        one, two = Node(), Node()
+        one.other, two.other = two, one
+        alive = weakref.ref(one)
+        del one, two
+        cost_meter.return_free_memory(peak_mb)
+        assert (alive() is None) == is_freed
+    finally:
+        gc.enable()

@@ -2,6 +2,7 @@
 
 import contextlib
 import ctypes
+import gc
 import os
 import resource
 import sys
@@ -14,6 +15,7 @@ from slamcli.console import Tell
 from slamcli.jit.compilation import COMPILING
 
 SAMPLING = 0.02  # [s] between looks at the resident memory
+MUCH = 512.0  # [MiB] taken by a stage, from which on 50 ms of looking for what can be freed are worth it
 
 
 class Meter:
@@ -66,8 +68,13 @@ class Meter:
                 return
 
 
-def return_free_memory() -> None:
-    """Hand what the stages before have freed back to the system, where the C library can: else it would count as the next stage's too."""
+def return_free_memory(peak_mb: float) -> None:
+    """Hand what a stage left back to the system, where the C library can: else it would count as the next stage's too.
+
+    peak_mb : what the stage took; where that is much, what its objects hold by referring to one another is looked for too
+    """
+    if peak_mb > MUCH:
+        gc.collect()
     with contextlib.suppress(OSError, AttributeError):  # a C library other than glibc
         ctypes.CDLL(None).malloc_trim(0)
 
