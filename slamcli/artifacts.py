@@ -2,7 +2,7 @@
 
 import io
 from collections.abc import Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import Field, fields
 from pathlib import Path
 from tokenize import TokenError
@@ -86,11 +86,13 @@ class Writer(Generic[Record]):
     def __init__(self, cls: type[Record], folder: Path, *growing: str) -> None:
         """Begin the files of the fields `growing`, without rows."""
         self._cls, self._folder = cls, folder
-        self._open = ExitStack()
-        self._specs = {spec.name: spec for spec in fields(cls)}  # type: ignore[arg-type]
-        self._growing = {name: _Growing(_new_path(cls, self._specs[name], folder), self._specs[name]) for name in growing}
-        for column in self._growing.values():
-            self._open.callback(column.close)
+        self._specs = {spec.name: spec for spec in fields(cls)}  # type: ignore[arg-type]  # mypy has no name for what is a dataclass
+        self._growing: dict[str, _Growing] = {}
+        with ExitStack() as opened:
+            for name in growing:
+                self._growing[name] = _Growing(_new_path(cls, self._specs[name], folder), self._specs[name])
+                opened.callback(self._growing[name].close)
+            self._open = opened.pop_all()
 
     def __enter__(self) -> "Writer[Record]":
         return self
@@ -141,7 +143,9 @@ class _Growing:
             self._file.close()
 
     def close(self) -> None:
-        self._file.close()
+        """Close the file; what `finish` did not write is given up, and why has been said: a full disk would only say it again."""
+        with suppress(OSError):
+            self._file.close()
 
     def _become(self, dtype: np.dtype) -> None:
         """Write anew, in another type, what is there."""
@@ -169,7 +173,7 @@ def load(cls: type[Record], folder: Path) -> Record:
     compiled once, while a write never reaches the file.
     """
     try:
-        value = cls(**{spec.name: _read(Path(folder) / f"{spec.name}.npy") for spec in fields(cls)})  # type: ignore[arg-type]
+        value = cls(**{spec.name: _read(Path(folder) / f"{spec.name}.npy") for spec in fields(cls)})  # type: ignore[arg-type]  # mypy has no name for what is a dataclass
         check(value)
     except ValueError as error:
         raise SlamError(f"{folder}: not what this version of slamcli writes ({error}); make it anew with: slamcli run --force") from error
@@ -178,7 +182,7 @@ def load(cls: type[Record], folder: Path) -> Record:
 
 def adopted(record: Record) -> Record:
     """Return a loaded record that is read alone: within a stage the memory of its arrays may be let go at any time."""
-    for spec in fields(record):  # type: ignore[arg-type]
+    for spec in fields(record):  # type: ignore[arg-type]  # mypy has no name for what is a dataclass
         mapped_memory.adopt(getattr(record, spec.name))
     return record
 

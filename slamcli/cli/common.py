@@ -197,4 +197,4 @@ def recording_options(function: Function) -> Function:
     )  # fmt: skip
     for option in reversed(options):
         wrapped = option(wrapped)
-    return wrapped  # type: ignore[return-value]
+    return wrapped  # type: ignore[return-value]  # click's options keep what they decorate

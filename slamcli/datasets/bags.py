@@ -315,7 +315,7 @@ class McapFile:
         if len(head) < 15 or head[0] != 7:
             raise SlamError(f"{self.path}: its index is damaged; repair it with `mcap recover`")
         (size,) = struct.unpack_from("<I", head, 11)
-        return list(struct.iter_unpack("<QQ", self._parts.at(offset + 15, size // 16 * 16)))  # type: ignore[arg-type]
+        return list(struct.iter_unpack("<QQ", self._parts.at(offset + 15, size // 16 * 16)))
 
     def _scan(self, found: dict[int, list[tuple[int, tuple[int, int]]]]) -> None:
         """Find messages without an index by walking over the file."""

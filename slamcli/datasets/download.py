@@ -114,7 +114,7 @@ def unpack(archive: Path, target: Path, *, progress: Progress) -> None:
         raise SlamError(f"{target}: exists already; remove it or use it")
     try:
         with staged(target) as staging, gzip.open(archive) as stream:
-            with tarfile.open(fileobj=_Bounded(stream), mode="r:") as tar:  # type: ignore[call-overload]
+            with tarfile.open(fileobj=_Bounded(stream), mode="r:") as tar:  # type: ignore[call-overload]  # it has what tarfile calls: read, seek, tell
                 _extract(tar, staging, target.name, progress)
             _drain(stream)
     except (tarfile.TarError, gzip.BadGzipFile, EOFError, ValueError, zlib.error) as error:

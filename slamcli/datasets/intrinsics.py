@@ -181,7 +181,7 @@ def _key_values(text: str) -> dict[str, float]:
 
 
 def _yaml(text: str, path: Path) -> Any:
-    import yaml  # type: ignore[import-untyped]
+    import yaml
 
     plain = re.sub(r"!!\S+", "", re.sub(r"^%YAML.*$", "", text, flags=re.MULTILINE))  # OpenCV's heading and its tags
     try:

@@ -4,6 +4,7 @@ import json
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -88,12 +89,12 @@ class Simulation:
         return Camera(self.width, self.height, focal, focal, (self.width - 1) / 2, (self.height - 1) / 2, depth_scale=DEPTH_SCALE)
 
 
-def simulate(out: Path, *, progress: Progress, workers: int = 2, **settings: object) -> Path:
+def simulate(out: Path, *, progress: Progress, workers: int = 2, **settings: Any) -> Path:
     """Write a simulated recording into the new folder `out`; see Simulation for the settings.
 
     The same settings give the same bytes. The folder appears only when complete.
     """
-    what = Simulation(**settings)  # type: ignore[arg-type]
+    what = Simulation(**settings)
     _check(what)
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise SlamError(f"{out}: exists already; name a new folder")
@@ -126,7 +127,7 @@ def _moved_things(what: Simulation, scene: Scene, motion: Motion) -> list[Moved]
     return found
 
 
-def simulate_several(out: Path, recordings: int, *, progress: Progress, workers: int = 2, **settings: object) -> list[Path]:
+def simulate_several(out: Path, recordings: int, *, progress: Progress, workers: int = 2, **settings: Any) -> list[Path]:
     """Write several recordings of one scene into the new folder `out`, as 1, 2, ... ; their true poses are told in one frame.
 
     Each begins elsewhere on the way, every second drives it the other way, and each has a light and stamps of its own. Each covers
@@ -134,7 +135,7 @@ def simulate_several(out: Path, recordings: int, *, progress: Progress, workers:
     """
     if not 1 <= recordings <= MOST_RECORDINGS:
         raise SlamError(f"recordings = {recordings}: must be from 1 to {MOST_RECORDINGS}")
-    laps = float(settings.get("laps", Simulation.laps))  # type: ignore[arg-type]
+    laps = float(settings.get("laps", Simulation.laps))
     share = (1.0 + OVERLAP) * laps / recordings
     made = []
     for take in range(recordings):

@@ -316,7 +316,7 @@ CASES = {
     "negative seconds before a trigger": Case(restamp(lambda t: t - 0.7)),
     "ticks of 90 kHz": Case(restamp(lambda t: np.rint(9e4 * t)), step=None),
     "depth in another folder": Case(lambda d: [(d / "depth").rename(d / "depths"), (d / "depth.txt").write_text((d / "depth.txt").read_text().replace("depth/", "depths/"))]),
-    "negative readings": Case(repaint(lambda i, raw: npy(np.where(raw == 0, -1, raw).astype(np.int32)), suffix=".npy"), holds=lambda s: not np.nanmin(s.depth(0)) < 0.0),
+    "negative readings": Case(repaint(lambda i, raw: npy(np.where(raw == 0, -1, raw.astype(np.int32))), suffix=".npy"), holds=lambda s: not np.nanmin(s.depth(0)) < 0.0),
     "float16 in metres": Case(then(recalibrate(("K.txt", MATRIX)), repaint(lambda i, raw: npy((raw / 5000).astype(np.float16)), suffix=".npy")), holds=lambda s: 0.5 < np.nanmedian(s.depth(0)) < 3.0),
     "infinite floats": Case(then(recalibrate(("K.txt", MATRIX)), repaint(lambda i, raw: npy(np.where(raw == 0, np.inf, raw / 5000).astype(np.float32)), suffix=".npy")), holds=lambda s: not np.isinf(s.depth(0)).any()),
     "a third axis of one": Case(repaint(lambda i, raw: npy(raw[..., None]), suffix=".npy")),
