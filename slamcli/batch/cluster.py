@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-MEMORY = 2 << 30  # bytes that a worker should have: twice the peak of a run of 10 000 frames
+MEMORY = 2 << 30  # bytes that a worker should have: more than twice the peak of a run of 30 000 frames
 CONNECT = 20.0  # [s] to wait for a scheduler
 RETRIES = 2  # of a task that ends in something other than a recording's own fault
 
