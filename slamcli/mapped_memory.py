@@ -26,7 +26,7 @@ LOOK = 0.02  # [s] between looks at the resident memory
 _CAN_RELEASE = hasattr(mmap, "MADV_DONTNEED")
 _maps: WeakSet[mmap.mmap] = WeakSet()  # whose pages may be dropped
 _lock = threading.Lock()  # of _maps
-_room: list[Path] = []  # folders for the files of large arrays, the innermost block's last
+_room: list[Path] = []  # folders for the files of large arrays, the latest block's last
 
 
 @contextmanager
@@ -39,7 +39,7 @@ def bounded(folder: Path) -> Iterator[None]:
     try:
         yield
     finally:
-        _room.pop()
+        _room.remove(folder)
         done.set()
         watch.join()
         if not _room:

@@ -246,7 +246,7 @@ class Pipeline:
             try:
                 from slamcli import mapped_memory
 
-                with Meter() as meter, one_thread_in_blas(), mapped_memory.bounded(out):
+                with Meter() as meter, one_thread_in_blas(), mapped_memory.bounded(self.run.path):
                     module = importlib.import_module(f"slamcli.stages.{stage.name}")
                     meter.watch_compiler(self._tell)
                     run = module.run if begun is None else begun.go_on
