@@ -45,7 +45,8 @@ def local(workers: int, memory: int, *, progress: Progress = silent, tell: Tell 
     options |= {"silence_logs": logging.CRITICAL}
     with ExitStack() as stack:
         folder = stack.enter_context(files.scratch("slamcli-batch-"))
-        stack.enter_context(dask.config.set(temporary_directory=str(folder)))  # of the scheduler, which takes no folder else
+        # The scheduler takes no folder else; and nobody looks at what each worker's profiler writes down a hundred times a second.
+        stack.enter_context(dask.config.set({"temporary_directory": str(folder), "distributed.worker.profile.enabled": False}))
         try:
             cluster = stack.enter_context(LocalCluster(processes=True, host="127.0.0.1", local_directory=str(folder), **options))
             client = stack.enter_context(Client(cluster))

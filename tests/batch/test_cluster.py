@@ -387,4 +387,6 @@ def test_a_cluster_of_this_machine_leaves_nothing_in_the_temporary_folder(tmp_pa
     with cluster.local(1, 1 << 30) as client:
         assert len(client.nthreads()) == 1
         assert any(tmp_path.iterdir())
+        profiled = client.run(lambda: __import__("dask").config.get("distributed.worker.profile.enabled"))
+        assert list(profiled.values()) == [False]
     assert list(tmp_path.iterdir()) == []
