@@ -57,10 +57,9 @@ class Rule:
 AT_ALL = Rule(QUICK_AFTER, min_through=1, weight_still=1.0, min_group=12, followed=0.0)
 # Poses that drift agree about views that are near in time only.
 UNDER_DRIFT = Rule(AFTER, min_through=1, weight_still=0.3, min_group=12, followed=1.0)
-# Poses may rest on what stands a while, but on nothing that moves. Maps show nothing that a later view looks through, and miss no view:
-# what is seen in one view alone, a leg at the picture's lower edge, need not be in them.
+# Poses may rest on what stands a while, but on nothing that moves. Maps show nothing that a later view looks through, and miss no view.
 FOR_POSES = Rule((*AFTER, *LATER), min_through=1, weight_still=1.0, min_group=12, followed=4.0)
-FOR_MAPS = Rule((*AFTER, *LATER, *MUCH_LATER), min_through=2, weight_still=0.15, min_group=4, followed=np.inf, spreads=True)
+FOR_MAPS = Rule((*AFTER, *LATER, *MUCH_LATER), min_through=1, weight_still=0.15, min_group=4, followed=np.inf, spreads=True)
 
 
 def is_any(views: Views) -> bool:
