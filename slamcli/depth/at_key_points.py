@@ -6,7 +6,7 @@ from numba import b1, f4, f8, i8
 from slamcli.jit.kernel import kernel
 
 USUAL_WIDTH = 640  # px
-JUMP_REACH = 3  # px to either side of a key point where a jump of depth is looked for: as far as FAST looks
+JUMP_REACH = 3  # px of its octave to either side of a key point where a jump of depth is looked for: as far as FAST looks
 SLOPE_REACH = 8  # px to either side of a key point from which the slope of its surface is read
 SLOPE_STEP = 2  # px between the pixels looked at: neighbours share most of their noise
 ONE, TWO = np.float32(1.0), np.float32(2.0)
@@ -30,35 +30,44 @@ def depth_at(depth: np.ndarray, xy: np.ndarray, *, window: int = 1) -> np.ndarra
     return readings[np.arange(len(xy)), np.maximum(n - 1, 0) // 2]
 
 
-def is_behind_outline(depth: np.ndarray, xy: np.ndarray, *, jump: float) -> np.ndarray:
+def is_behind_outline(depth: np.ndarray, xy: np.ndarray, scale: np.ndarray, *, jump: float) -> np.ndarray:
     """Say beside which raw points xy (N, 2) something else is nearer by more than the share `jump` of depth (H, W) [m], (N,) bool.
+
+    scale : (N,) by how many times the image was made smaller where a point was found; as far around it an outline may be what was found
 
     Where a surface goes behind the outline of another is no fixed point in space, and a pixel more to that side the depth is the other's.
     On the nearer side the corner of a thing mostly is one, so it keeps its depth.
     Along a line over a plane, however slanted, the inverse of depth is linear in pixels: beside something nearer it bends up. In an image
-    less than 640 pixels wide as many pixels span a wider angle, and each fold of a surface bends more: `jump` grows in proportion.
+    less than 640 pixels wide as many pixels span a wider angle, and each fold of a surface bends more, as it does farther from it: `jump`
+    grows in proportion.
     """
     is_behind, least = np.empty(len(xy), dtype=np.bool_), jump * _coarseness(depth)
-    at = np.rint(xy).astype(np.int64)
-    _is_behind_outline(np.ascontiguousarray(depth, dtype=np.float32), at, JUMP_REACH, np.float32(least), is_behind)
+    at, reach = np.rint(xy).astype(np.int64), np.rint(JUMP_REACH * scale).astype(np.int64)
+    _is_behind_outline(np.ascontiguousarray(depth, dtype=np.float32), at, reach, np.float32(least), is_behind)
     return is_behind
 
 
 @kernel(error_model="numpy")
-def _is_behind_outline(depth: f4[:, ::1], at: i8[:, ::1], reach: i8, least: f4, is_behind: b1[::1]) -> None:
+def _is_behind_outline(depth: f4[:, ::1], at: i8[:, ::1], farthest: i8[::1], least: f4, is_behind: b1[::1]) -> None:
     height, width = depth.shape
     for n in range(len(at)):
         column, row = at[n, 0], at[n, 1]
-        up, down = max(row - reach, 0), min(row + reach, height - 1)
-        left, right = max(column - reach, 0), min(column + reach, width - 1)
         here = ONE / depth[row, column]
-        limit, both = least * here, TWO * here
-        is_behind[n] = (
-            (ONE / depth[row, right] + ONE / depth[row, left]) - both > limit
-            or (ONE / depth[down, column] + ONE / depth[up, column]) - both > limit
-            or (ONE / depth[down, right] + ONE / depth[up, left]) - both > limit
-            or (ONE / depth[down, left] + ONE / depth[up, right]) - both > limit
-        )
+        both = TWO * here
+        is_behind[n] = False
+        for step in range(JUMP_REACH, farthest[n] + JUMP_REACH, JUMP_REACH):
+            reach = min(step, farthest[n])
+            limit = least * here * np.float32(reach) / np.float32(JUMP_REACH)
+            up, down = max(row - reach, 0), min(row + reach, height - 1)
+            left, right = max(column - reach, 0), min(column + reach, width - 1)
+            if (
+                (ONE / depth[row, right] + ONE / depth[row, left]) - both > limit
+                or (ONE / depth[down, column] + ONE / depth[up, column]) - both > limit
+                or (ONE / depth[down, right] + ONE / depth[up, left]) - both > limit
+                or (ONE / depth[down, left] + ONE / depth[up, right]) - both > limit
+            ):
+                is_behind[n] = True
+                break
 
 
 def inverse_depth_slope(depth: np.ndarray, xy: np.ndarray) -> np.ndarray:

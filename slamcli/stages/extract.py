@@ -177,7 +177,9 @@ def _extract(dataset: Dataset, settings: ExtractConfig, i: int) -> Frame:
         return Frame(points, nowhere, slope=np.zeros((len(points), 2), np.float32), coarse=None, faults=faults)
     read = at_key_points.depth_at(depth, points.xy, window=settings.depth_window)
     if settings.depth_jump:
-        read = np.where(at_key_points.is_behind_outline(depth, points.xy, jump=settings.depth_jump), np.float32(np.nan), read)
+        scale = np.cumprod([1.0] + [settings.scale] * (settings.levels - 1))[points.octave]
+        is_behind = at_key_points.is_behind_outline(depth, points.xy, scale, jump=settings.depth_jump)
+        read = np.where(is_behind, np.float32(np.nan), read)
     slope, readings = at_key_points.inverse_depth_slope(depth, points.xy), stream_doubt.look(depth)
     return Frame(points, read, slope, coarse_images.code_of(icp.coarsen(depth)), faults, readings, _counts(dataset, depth, i))
 

@@ -14,25 +14,45 @@ def test_depth_is_the_nearest_pixels_or_the_median_of_a_square() -> None:
     np.testing.assert_array_equal(at_key_points.depth_at(depth, xy, window=3), [4, 2, 9, np.nan])
 
 
+def behind(depth: np.ndarray, at: np.ndarray, *, jump: float, scale: float = 1.0) -> np.ndarray:
+    return at_key_points.is_behind_outline(depth, at, np.full(len(at), scale), jump=jump)
+
+
 def test_what_is_behind_an_outline_is_told_from_the_outline_a_slope_a_fold_and_a_hole() -> None:
     v, u = np.mgrid[:60, :640].astype(float)
     slope = 1.0 / (0.2 + 0.004 * u + 0.001 * v)  # a plane: 5 m on the left, 1.9 m on the right
     fold = 1.0 / (0.4 + 0.002 * np.abs(u - 40))
     step = np.where(u < 40, 2.0, 2.3)
     at = np.array([[x, 30.0] for x in (20.0, 36.0, 37.4, 40.0, 42.0, 43.0, 60.0)])
-    assert (
-        not at_key_points.is_behind_outline(slope, at, jump=0.05).any() and not at_key_points.is_behind_outline(fold, at, jump=0.05).any()
-    )
-    np.testing.assert_array_equal(at_key_points.is_behind_outline(step, at, jump=0.05), [False, False, False, True, True, False, False])
-    assert not at_key_points.is_behind_outline(step, at, jump=0.2).any()
+    assert not behind(slope, at, jump=0.05).any() and not behind(fold, at, jump=0.05).any()
+    np.testing.assert_array_equal(behind(step, at, jump=0.05), [False, False, False, True, True, False, False])
+    assert not behind(step, at, jump=0.2).any()
     corner = np.where((u < 40) & (v < 30), 2.0, 3.0)
-    assert at_key_points.is_behind_outline(corner, np.array([[38.0, 28.0], [41.0, 31.0], [41.0, 20.0]]), jump=0.05).tolist() == [
+    assert behind(corner, np.array([[38.0, 28.0], [41.0, 31.0], [41.0, 20.0]]), jump=0.05).tolist() == [
         False,
         True,
         True,
     ]
     step[28:33, 30:34] = np.nan
-    assert not at_key_points.is_behind_outline(step, np.array([[28.0, 30.0], [32.0, 30.0]]), jump=0.05).any()
+    assert not behind(step, np.array([[28.0, 30.0], [32.0, 30.0]]), jump=0.05).any()
+
+
+def test_an_outline_is_looked_for_as_far_as_a_corner_of_the_points_octave_reaches() -> None:
+    u = np.mgrid[:60, :640][1]
+    step, fold = np.where(u < 40, 1.2, 2.0), 1.0 / (0.4 + 0.002 * np.abs(u - 40))
+    at = np.array([[x, 30.0] for x in range(30, 60)])
+    for octave in range(8):
+        scale = 1.2**octave
+        is_behind = behind(step, at, jump=0.05, scale=scale)
+        assert np.flatnonzero(is_behind).tolist() == list(range(10, 10 + round(3 * scale)))
+        assert not behind(fold, at, jump=0.05, scale=scale).any()
+
+
+def test_a_pole_nearer_than_the_farthest_that_is_looked_at_is_an_outline_too() -> None:
+    u = np.mgrid[:60, :640][1]
+    pole = np.where((u >= 38) & (u < 41), 1.2, 2.0)
+    at = np.array([[46.0, 30.0], [33.0, 30.0], [60.0, 30.0]])
+    assert behind(pole, at, jump=0.05, scale=3.6).tolist() == [True, True, False] and not behind(pole, at, jump=0.05).any()
 
 
 def test_the_slope_of_a_plane_is_exact_up_to_the_border_and_past_holes() -> None:
@@ -86,6 +106,6 @@ def test_outlines_are_told_as_by_the_slow_twin_at_every_pixel() -> None:
 
     bend = [inverse(d, r) + inverse(-d, -r) - 2 * inverse(0, 0) for d, r in ((0, 1), (1, 0), (1, 1), (1, -1))]
     expected = (np.array(bend) > np.float32(0.05 * 640 / 50) * inverse(0, 0)).any(axis=0)
-    found = at_key_points.is_behind_outline(depth, np.stack([column, row], axis=1).astype(np.float32), jump=0.05)
+    found = behind(depth, np.stack([column, row], axis=1).astype(np.float32), jump=0.05)
     assert 50 < expected.sum() < 1500
     np.testing.assert_array_equal(found, expected)

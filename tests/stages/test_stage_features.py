@@ -65,7 +65,11 @@ def test_features_are_those_of_each_frame(room: Path, features: Features) -> Non
         column, row = np.rint(points.xy).astype(int).T
         depth, found = dataset.depth(i), np.isfinite(features.depth[span])
         np.testing.assert_array_equal(features.depth[span][found], depth[row, column][found])
-        is_without = np.isnan(depth[row, column]) | at_key_points.is_behind_outline(depth, points.xy, jump=Config().extract.depth_jump)
+        settings = Config().extract
+        is_behind = at_key_points.is_behind_outline(
+            depth, points.xy, settings.scale ** points.octave.astype(float), jump=settings.depth_jump
+        )
+        is_without = np.isnan(depth[row, column]) | is_behind
         np.testing.assert_array_equal(~found, is_without)
     assert 0.3 < np.isfinite(features.depth).mean() <= 1.0
 
