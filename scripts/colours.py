@@ -55,7 +55,7 @@ class Sampled:
         self.key, self.colour, self.tile = key, colour, tile
 
     @classmethod
-    def of(cls, view: densify.View, kinds: list[densify.Colours]) -> "Sampled":
+    def of(cls, view: densify.KeyFrameView, kinds: list[densify.Colours]) -> "Sampled":
         """Sample a view."""
         xyz = se3.transform(view.T_wk, view.seen.xyz_c.astype(np.float64))
         cell = np.floor((xyz + SHIFT) / SIDE).astype(np.int64) + HALF_EXTENT

@@ -61,7 +61,7 @@ def score(config: Config, seed: int, drive: dict) -> grid_truth.GridScore:
     T_lc = se3.inverse(T_SL) @ T_sc @ se3.exp(np.random.default_rng(1).normal(0, 1, (len(T_sc), 6)) * POSE_NOISE)
     made = grid.build_grid(zip(depth, T_lc, strict=True), what.camera(), settings=settings, sensor=config.sensor)
     about = scene.to_dict()
-    truth = grid_truth.Scene(np.array(about["room"]["min"], float), np.array(about["room"]["max"], float), about["obstacles"])
+    truth = grid_truth.TrueRoom(np.array(about["room"]["min"], float), np.array(about["room"]["max"], float), about["obstacles"])
     seen = (grid_truth.exact_points(truth, z, T, what.camera(), max_range=settings.max_range) for z, T in zip(depth, T_sc, strict=True))
     return grid_truth.score(made, truth, T_SL, seen, band=(settings.band_low, settings.band_high))
 

@@ -6,7 +6,7 @@ as its data sheet says. It gets the poses of the camera's own map, so that only 
 
 import numpy as np
 
-from slamcli.evaluation.grid_truth import Scene, cast
+from slamcli.evaluation.grid_truth import TrueRoom, cast
 from slamcli.navigation.grid import decide
 from slamcli.schema import Grid
 
@@ -16,7 +16,7 @@ MOUNT = 0.2  # [m] above the floor: under the hanging box, over the low one
 HIT, MISS, LIMIT = np.log(0.7 / 0.3), np.log(0.4 / 0.6), 4.0  # log-odds of one reading, and their bound
 
 
-def scan(scene: Scene, T_sc: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+def scan(scene: TrueRoom, T_sc: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Scan from below the true camera pose; returns angles to its heading [rad] and distances [m], NaN = none."""
     angle = np.arange(-HALF_ANGLE, HALF_ANGLE + 1e-9, STEP)
     heading = np.arctan2(T_sc[1, 2], T_sc[0, 2])
@@ -26,7 +26,7 @@ def scan(scene: Scene, T_sc: np.ndarray, rng: np.random.Generator) -> tuple[np.n
     return angle, np.where((noisy >= NEAR) & (noisy <= FAR), noisy, np.nan)
 
 
-def laser_grid(scene: Scene, T_sc: np.ndarray, T_lc: np.ndarray, like: Grid, rng: np.random.Generator) -> Grid:
+def laser_grid(scene: TrueRoom, T_sc: np.ndarray, T_lc: np.ndarray, like: Grid, rng: np.random.Generator) -> Grid:
     """Make a grid with the cells of `like` from scans at the true poses T_sc, entered at the estimated ones T_lc, (N, 4, 4) each."""
     log_odds = np.zeros(like.state.shape)
     n_seen = np.zeros(like.state.shape, dtype=np.int32)

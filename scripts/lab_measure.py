@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slamcli.evaluation.grid_truth import Scene
+from slamcli.evaluation.grid_truth import TrueRoom
 from slamcli.geometry import se3
 from slamcli.navigation.grid import FREE, OCCUPIED
 from slamcli.schema import Grid
@@ -41,7 +41,7 @@ class Line:
     found: float  # m, length found
 
 
-def outlines(scene: Scene, height: float) -> list[Outline]:
+def outlines(scene: TrueRoom, height: float) -> list[Outline]:
     """List the walls and the sides of the boxes that are there at a height [m]."""
     (x0, y0), (x1, y1) = scene.low[:2], scene.high[:2]
     mx, my = 0.5 * (x0 + x1), 0.5 * (y0 + y1)

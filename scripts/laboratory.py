@@ -25,7 +25,7 @@ from slamcli import console
 from slamcli.datasets.simulate import simulate
 from slamcli.errors import SlamError
 from slamcli.evaluation import grid_truth
-from slamcli.evaluation.grid_truth import Scene
+from slamcli.evaluation.grid_truth import TrueRoom
 from slamcli.geometry import se3
 from slamcli.navigation import grid as grid_module
 from slamcli.navigation import planner
@@ -47,7 +47,7 @@ class Lab:
     """One run of the laboratory and its truth."""
 
     run: RunDir
-    scene: Scene
+    scene: TrueRoom
     grid: Grid
     laser: Grid
     T_lc: np.ndarray  # (N, 4, 4) estimated poses of the frames the grid looked at

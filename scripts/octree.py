@@ -83,7 +83,7 @@ def truth(run: RunDir) -> list[str]:
     ]
 
 
-def surface_distance(scene: grid_truth.Scene, x: np.ndarray) -> np.ndarray:
+def surface_distance(scene: grid_truth.TrueRoom, x: np.ndarray) -> np.ndarray:
     """Return the distance of points (N, 3) to the nearest surface of the room and the solids in it [m]."""
     out = np.abs(_box_distance(x - 0.5 * (scene.low + scene.high), 0.5 * (scene.high - scene.low)))
     for solid in scene.solids:

@@ -49,7 +49,7 @@ def track(root: Path, lines: list[list[str]], camera: dict, voxel: float) -> tup
     matrix = o3d.core.Tensor([[camera["fx"], 0.0, camera["cx"]], [0.0, camera["fy"], camera["cy"]], [0.0, 0.0, 1.0]])
     T_wc = np.eye(4)
     model = o3d.t.pipelines.slam.Model(voxel, BLOCK_SIDE, BLOCKS, o3d.core.Tensor(T_wc), device)
-    seen, synthesised = (o3d.t.pipelines.slam.Frame(camera["height"], camera["width"], matrix, device) for _ in range(2))
+    seen, synthesized = (o3d.t.pipelines.slam.Frame(camera["height"], camera["width"], matrix, device) for _ in range(2))
     scale, stamps, poses, decoding = float(camera["depth_scale"]), [], [], 0.0
     for k, (stamp, colour, _, depth) in enumerate(lines):
         before = time.thread_time()
@@ -60,13 +60,13 @@ def track(root: Path, lines: list[list[str]], camera: dict, voxel: float) -> tup
         seen.set_data_from_image("color", o3d.t.geometry.Image(rgb))
         if k:
             try:
-                moved = model.track_frame_to_model(seen, synthesised, scale, DEPTH_MAX, FARTHEST)
+                moved = model.track_frame_to_model(seen, synthesized, scale, DEPTH_MAX, FARTHEST)
             except RuntimeError:  # too few pixels agree: lost
                 continue
             T_wc = T_wc @ moved.transformation.numpy()
         model.update_frame_pose(k, o3d.core.Tensor(T_wc))
         model.integrate(seen, scale, DEPTH_MAX, TRUNCATION)
-        model.synthesize_model_frame(synthesised, scale, 0.1, DEPTH_MAX, TRUNCATION, False)
+        model.synthesize_model_frame(synthesized, scale, 0.1, DEPTH_MAX, TRUNCATION, False)
         stamps.append(float(stamp))
         poses.append(T_wc.copy())
     return stamps, poses, decoding

@@ -39,7 +39,7 @@ def repaint(folder: Path, kind: str, change: Callable[[np.ndarray], np.ndarray],
         cv2.imwrite(str(folder / name), change(picture))
 
 
-def anonymise(folder: Path) -> Path:
+def anonymize(folder: Path) -> Path:
     """Name files by number instead of by stamp."""
     for kind in ("rgb", "depth"):
         rows = []

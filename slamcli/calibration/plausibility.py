@@ -48,7 +48,7 @@ class Deviation:
 
 
 @dataclass(frozen=True)
-class Seen:
+class SeenTwice:
     """Points as one view sees them, row by row those of another view."""
 
     xy: np.ndarray  # (N, 2) px, undistorted
@@ -91,7 +91,7 @@ def rigidity(sparse_map: SparseMap, camera: Camera, sensor: SensorConfig) -> Rig
     return most_rigid((_shared(sparse_map, i, j) for i, j in _pairs(sparse_map)), camera, sensor)
 
 
-def most_rigid(views: Iterable[tuple[Seen, Seen]], camera: Camera, sensor: SensorConfig) -> Rigidity | None:
+def most_rigid(views: Iterable[tuple[SeenTwice, SeenTwice]], camera: Camera, sensor: SensorConfig) -> Rigidity | None:
     """Find the focal length under which points are most rigid, of which each pair of views shows some, row by row.
 
     None where no pair shows enough points with depth. Some rows may be false matches.
@@ -114,18 +114,18 @@ def _pairs(sparse_map: SparseMap) -> list[tuple[int, int]]:
     return [found[k] for k in sorted({int(k) for k in np.linspace(0, len(found) - 1, min(len(found), MOST_PAIRS))})] if found else []
 
 
-def _shared(sparse_map: SparseMap, i: int, j: int) -> tuple[Seen, Seen]:
+def _shared(sparse_map: SparseMap, i: int, j: int) -> tuple[SeenTwice, SeenTwice]:
     """Return how two key frames see the landmarks that they share."""
     first, second = (sparse_map.rows_of(kf) for kf in (i, j))
     # A landmark is seen once by a key frame; features without one are told apart by their numbers.
     of_first, of_second = (np.where(ids >= 0, ids, -k) for ids, k in ((sparse_map.lm_of_row[first], 1), (sparse_map.lm_of_row[second], 2)))
     _, at_first, at_second = np.intersect1d(of_first, of_second, return_indices=True)
     features, rows = sparse_map.features, (first.start + at_first, second.start + at_second)
-    a, b = (Seen(np.asarray(features.xy[row], dtype=np.float64), np.asarray(features.depth[row], dtype=np.float64)) for row in rows)
+    a, b = (SeenTwice(np.asarray(features.xy[row], dtype=np.float64), np.asarray(features.depth[row], dtype=np.float64)) for row in rows)
     return a, b
 
 
-def _misfit(a: Seen, b: Seen, camera: Camera, sensor: SensorConfig) -> np.ndarray | None:
+def _misfit(a: SeenTwice, b: SeenTwice, camera: Camera, sensor: SensorConfig) -> np.ndarray | None:
     """Return how far points seen twice are from a rigid body, median in standard deviations, for each of FACTORS; None of too few."""
     with np.errstate(invalid="ignore"):
         is_near = (a.depth < FARTHEST) & (b.depth < FARTHEST)

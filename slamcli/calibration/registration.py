@@ -12,7 +12,7 @@ from slamcli.config.options import SensorConfig
 from slamcli.estimation import shared_parameters
 from slamcli.estimation.bundle_problem import Problem
 from slamcli.estimation.robust_loss import LEAST_SQUARES
-from slamcli.estimation.shared_parameters import Evidence
+from slamcli.estimation.shared_parameters import SharedEvidence
 from slamcli.geometry.algebra import product
 from slamcli.geometry.camera import Camera
 from slamcli.geometry.depth_registration import Registration
@@ -23,7 +23,7 @@ from slamcli.sparse_map.sparse_map import SparseMap
 N_UNKNOWNS = 9
 
 
-def evidence(sparse_map: SparseMap, now: Sensing, sensor: SensorConfig, registration: Registration) -> Evidence | None:
+def evidence(sparse_map: SparseMap, now: Sensing, sensor: SensorConfig, registration: Registration) -> SharedEvidence | None:
     """Gather what an adjusted map says of changes to its depth camera; None where the map is not determined."""
     n = len(sparse_map.kf)
     gathered = map_adjustment.gather(sparse_map, np.arange(n, dtype=np.int32), sensor)

@@ -63,7 +63,7 @@ def velocity(xyz_c: np.ndarray, twist: np.ndarray) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class Flow:
+class ImageMotion:
     """What the camera's motion does to measurements."""
 
     px_per_s: np.ndarray  # (N, 2) px/s, of the points in the image
@@ -72,7 +72,7 @@ class Flow:
     share: np.ndarray  # (N,) -0.5 to 0.5, when in the readout each was measured
 
 
-def flow(features: Features, twist: np.ndarray, camera: Camera, rows: np.ndarray) -> Flow:
+def flow(features: Features, twist: np.ndarray, camera: Camera, rows: np.ndarray) -> ImageMotion:
     """Return what the camera's motion `twist` (F, 6) does to the measurements `rows` (N,)."""
     frame = np.searchsorted(features.offset, rows, side="right") - 1
     xy = np.asarray(features.xy[rows], dtype=np.float64)
@@ -82,7 +82,7 @@ def flow(features: Features, twist: np.ndarray, camera: Camera, rows: np.ndarray
     focal = np.array([camera.fx, camera.fy])
     px_per_s = focal * (v[:, :2] - x_c[:, :2] / x_c[:, 2:] * v[:, 2:]) / x_c[:, 2:]
     slant_per_s = -(x_c[:, 2] ** 2) * (np.asarray(features.slope[rows], dtype=np.float64) * px_per_s).sum(axis=1)
-    return Flow(px_per_s, v[:, 2] - slant_per_s, slant_per_s, xy[:, 1] / camera.height - 0.5)
+    return ImageMotion(px_per_s, v[:, 2] - slant_per_s, slant_per_s, xy[:, 1] / camera.height - 0.5)
 
 
 def rectify(features: Features, timing: Timing, camera: Camera) -> Features:

@@ -147,7 +147,7 @@ def _unit_sigma(problem: Problem, lm: np.ndarray) -> float:
 
 
 def _ask(
-    sparse_map: SparseMap, part: map_adjustment.Part, now: Sensing, prior: dict[str, float]
+    sparse_map: SparseMap, part: map_adjustment.MapPart, now: Sensing, prior: dict[str, float]
 ) -> tuple[Problem, np.ndarray, float] | None:
     """Make the problem whose optimum the map is, what each unknown does to its measurements (O, 3, G), and the depth that offsets turn about."""
     if len(part.row) == 0 or not prior:

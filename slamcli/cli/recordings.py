@@ -11,10 +11,10 @@ import click
 from slamcli.cli.common import Target, complete_target, json_option, recording_options
 
 
-@click.command("formats", short_help="List the layouts of recordings that open, and how each is recognised.")
+@click.command("formats", short_help="List the layouts of recordings that open, and how each is recognized.")
 @json_option
 def formats(as_json: bool) -> None:
-    """List the layouts of recordings that open, and how each is recognised.
+    """List the layouts of recordings that open, and how each is recognized.
 
     A layout marked with an extra needs more than a plain install, such as: pip install 'slamcli[video]'
     """

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from slamcli.runs.run_directory import RunDir
-    from slamcli.visualization.render import View
+    from slamcli.visualization.render import Viewpoint
 
 PICTURES, FILM = (".png", ".jpg"), ".mp4"
 INSIDE_FIELD_OF_VIEW = 75.0  # [degrees] of films along the way: from inside a room, less shows little
@@ -63,7 +63,7 @@ def render_command(
     if ending == FILM:
         if what != "cloud":
             raise SlamError(f"{out}: only the cloud is filmed; leave out --what {what}, or draw a picture")
-        view = render.View(azimuth, elevation, *_even(size))
+        view = render.Viewpoint(azimuth, elevation, *_even(size))
         n = _film(out, folder, tour, view, seconds, path)
         told = f"{n} frames of {view.width} x {view.height} px"
         tell_written(out, as_json, told, what=what, frames=n, width=view.width, height=view.height)
@@ -71,7 +71,7 @@ def render_command(
     if what == "plan":
         image = _draw_plan(folder, below, size, path)
     else:
-        view = render.View(azimuth_deg=azimuth, elevation_deg=elevation, width=size[0], height=size[1])
+        view = render.Viewpoint(azimuth_deg=azimuth, elevation_deg=elevation, width=size[0], height=size[1])
         image = (_draw_cloud if what == "cloud" else _draw_octree)(folder, view, path)
     _write_picture(out, ending, image)
     height, width = image.shape[:2]
@@ -89,7 +89,7 @@ def _write_picture(out: Path, ending: str, image: np.ndarray) -> None:
     files.write_bytes(out, data.tobytes())
 
 
-def _draw_cloud(folder: RunDir, view: View, path: np.ndarray | None) -> np.ndarray:
+def _draw_cloud(folder: RunDir, view: Viewpoint, path: np.ndarray | None) -> np.ndarray:
     from slamcli.formats import cloud
     from slamcli.visualization import render
 
@@ -97,7 +97,7 @@ def _draw_cloud(folder: RunDir, view: View, path: np.ndarray | None) -> np.ndarr
     return render.draw_cloud(xyz, rgb, normal, spacing=folder.config().densify.voxel, view=view, path=path)
 
 
-def _draw_octree(folder: RunDir, view: View, path: np.ndarray | None) -> np.ndarray:
+def _draw_octree(folder: RunDir, view: Viewpoint, path: np.ndarray | None) -> np.ndarray:
     from slamcli.formats import octomap
     from slamcli.visualization import render
 
@@ -116,7 +116,7 @@ def _draw_plan(folder: RunDir, below: float, size: tuple[int, int], path: np.nda
     return image
 
 
-def _film(out: Path, folder: RunDir, tour: str, view: View, seconds: float, path: np.ndarray | None) -> int:
+def _film(out: Path, folder: RunDir, tour: str, view: Viewpoint, seconds: float, path: np.ndarray | None) -> int:
     """Write a film; returns the number of its pictures."""
     from dataclasses import replace
 

@@ -71,7 +71,7 @@ def sharpness(grey: np.ndarray) -> float:
     return float(np.abs(cv2.Laplacian(image, cv2.CV_32F)).mean(dtype=np.float64) / max(change, 1.0))
 
 
-class Surface(NamedTuple):
+class TexelSurface(NamedTuple):
     """M triangles and the N texels on them, sorted by triangle."""
 
     first: i4[::1]  # (M + 1,) row of each triangle's first texel
@@ -119,7 +119,7 @@ class Painter:
         a, b, c = corner.transpose(1, 0, 2).astype(np.float64)
         normal = np.cross(b - a, c - a)
         normal = (normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)).astype(np.float32)
-        self._surface = Surface(first, corner, normal, _mixed(corner, share, of))
+        self._surface = TexelSurface(first, corner, normal, _mixed(corner, share, of))
         self._plain = _mixed(mesh.rgb[mesh.triangle].astype(np.float32), share, of)
         self._paint = Paint(np.zeros((len(of), 3), np.float32), np.zeros(len(of), np.float32))
 
@@ -237,7 +237,7 @@ def _shares(x, y, corners, doubled_area):
 
 
 @kernel
-def _add(surface: Surface, shown: Shown, camera: Pinhole, paint: Paint):
+def _add(surface: TexelSurface, shown: Shown, camera: Pinhole, paint: Paint):
     """Add to the texels the colours that a view has of them, times its weight."""
     first, corner, normal, xyz = surface
     rgb, depth, near, T, centre, quality = shown

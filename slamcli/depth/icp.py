@@ -18,7 +18,7 @@ import numpy as np
 from slamcli.config.options import SensorConfig, SurfaceConfig
 from slamcli.depth import icp_kernels as kernels
 from slamcli.depth import noise_model, oriented_points
-from slamcli.depth.icp_kernels import NormalEquations, Points, Rule, View
+from slamcli.depth.icp_kernels import AgreementRule, NormalEquations, PointImage, Points
 from slamcli.geometry import depth_noise, se3
 from slamcli.geometry.algebra import eigh, product
 from slamcli.geometry.camera import Camera
@@ -35,7 +35,7 @@ READINGS_AS_ONE = 500.0
 START_SIGMA = np.array([0.2, 0.2, 0.2, 0.2, 0.2, 0.2])
 DIRECTIONS = 6  # of motion
 DETERMINED_SIGMA = 0.01  # [m] a direction known to this at the mean depth is determined; noise alone feigns 0.015 to 0.03 over planes
-RULE = Rule(MIN_COSINE, HUBER_CHI2, READINGS_AS_ONE)
+RULE = AgreementRule(MIN_COSINE, HUBER_CHI2, READINGS_AS_ONE)
 
 
 class Pass(NamedTuple):
@@ -77,9 +77,9 @@ class OrientedPoints:
         return Points(self.xyz, self.normal, self.variance)
 
     @property
-    def view(self) -> View:
+    def view(self) -> PointImage:
         """Return which point each pixel shows, as the kernels take it."""
-        return View(self.row, self.pinhole)
+        return PointImage(self.row, self.pinhole)
 
 
 @dataclass(frozen=True)

@@ -22,14 +22,14 @@ class Points(NamedTuple):
     variance: f4[::1]  # (N,) [m^2], of a reading along the ray
 
 
-class View(NamedTuple):
+class PointImage(NamedTuple):
     """Which point each pixel shows."""
 
     row: i4[:, ::1]  # (h, w), -1 = none
     pinhole: f8[::1]  # fx, fy, cx, cy [px]
 
 
-class Rule(NamedTuple):
+class AgreementRule(NamedTuple):
     """When points that meet agree, and what they count."""
 
     min_cosine: float  # of their normals
@@ -172,9 +172,9 @@ def align(
     T_ij: f8[:, ::1],
     source: Points,
     target: Points,
-    view: View,
+    view: PointImage,
     schedule: f8[:, ::1],
-    rule: Rule,
+    rule: AgreementRule,
     known: NormalEquations,
     out: NormalEquations,
 ):

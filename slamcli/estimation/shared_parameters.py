@@ -28,7 +28,7 @@ class Shared:
 
 
 @dataclass(frozen=True)
-class Evidence:
+class SharedEvidence:
     """What observations alone say of shared numbers g, the map eliminated: information @ g = pull."""
 
     information: np.ndarray  # (G, G)
@@ -49,7 +49,7 @@ def estimate(problem: Problem, columns: np.ndarray, *, prior: np.ndarray, prior_
     return Shared(value=solve(A, seen.pull + prior * weight), sigma=np.sqrt(np.diag(inverse(A))))
 
 
-def evidence(problem: Problem, columns: np.ndarray) -> Evidence | None:
+def evidence(problem: Problem, columns: np.ndarray) -> SharedEvidence | None:
     """Gather what the observations of a problem at its optimum say of shared numbers; arguments as for `estimate`."""
     columns = columns[problem.order]
     # Outliers stay out; among the inliers Huber's weights are close to 1 and are left out.
@@ -70,7 +70,7 @@ def evidence(problem: Problem, columns: np.ndarray) -> Evidence | None:
     through_landmarks = np.array([[_landmark_product(a, problem.V_inv, b) for b in (*lifted, b_0)] for a in lifted])
     through_map = product(reduced, solved.T) + through_landmarks
     # b is minus the gradient: J_map^T w r = -b_0
-    return Evidence(product(J.T, J) - through_map[:, :-1], product(J.T, r.ravel()) + through_map[:, -1])
+    return SharedEvidence(product(J.T, J) - through_map[:, :-1], product(J.T, r.ravel()) + through_map[:, -1])
 
 
 def _landmark_product(a: np.ndarray, V_inv: np.ndarray, b: np.ndarray) -> float:

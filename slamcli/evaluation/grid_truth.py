@@ -27,7 +27,7 @@ SPECIAL = ("hanging_box", "low_box")
 
 
 @dataclass(frozen=True)
-class Scene:
+class TrueRoom:
     """A room and the solids in it, level frame, metres and radians."""
 
     low: np.ndarray  # (3,) corner of the room with the smallest coordinates
@@ -42,12 +42,12 @@ class Scene:
         return inside
 
 
-def read_scene(path: Path) -> Scene:
+def read_scene(path: Path) -> TrueRoom:
     """Read scene.json; SlamError when it is not one."""
     try:
         about = json.loads(files.read_bytes(path, limit=files.LARGEST_JSON).decode("utf-8"))
         low, high = (_numbers(about["room"][name], 3) for name in ("min", "max"))
-        return Scene(np.array(low), np.array(high), [_solid(one) for one in about["obstacles"]])
+        return TrueRoom(np.array(low), np.array(high), [_solid(one) for one in about["obstacles"]])
     except OSError as error:
         raise SlamError(f"{path}: cannot be read ({error.strerror}); only simulated recordings have it") from error
     except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
@@ -88,7 +88,7 @@ def footprint(solid: dict[str, Any], xy: np.ndarray, low: float, high: float) ->
     return (np.abs(along) <= solid["size"][0] / 2) & (np.abs(across) <= solid["size"][1] / 2)
 
 
-def cast(scene: Scene, origin: np.ndarray, ray: np.ndarray) -> np.ndarray:
+def cast(scene: TrueRoom, origin: np.ndarray, ray: np.ndarray) -> np.ndarray:
     """Return the multiple of each ray (N, 3) from `origin` (3,) at which it meets a wall, floor, ceiling or solid."""
     with np.errstate(divide="ignore", invalid="ignore"):
         distance = _through_slabs(origin, ray, scene.low, scene.high)[1]
@@ -119,7 +119,7 @@ def _through_cylinder(start: np.ndarray, ray: np.ndarray, radius: float, height:
     return np.maximum((-b - root) / a, np.minimum(low, high)), np.minimum((-b + root) / a, np.maximum(low, high))
 
 
-def exact_points(scene: Scene, depth: np.ndarray, T_sk: np.ndarray, camera: Camera, *, max_range: float, stride: int = 4) -> np.ndarray:
+def exact_points(scene: TrueRoom, depth: np.ndarray, T_sk: np.ndarray, camera: Camera, *, max_range: float, stride: int = 4) -> np.ndarray:
     """Return the points (N, 3) that every `stride`-th pixel with a reading up to max_range [m] truly showed.
 
     A reading far before all of the scene shows what is no part of it, such as somebody who walks by.
@@ -153,7 +153,7 @@ class GridScore:
         return asdict(self)
 
 
-def score(grid: Grid, scene: Scene, T_sl: np.ndarray, points: Iterable[np.ndarray], *, band: tuple[float, float]) -> GridScore:
+def score(grid: Grid, scene: TrueRoom, T_sl: np.ndarray, points: Iterable[np.ndarray], *, band: tuple[float, float]) -> GridScore:
     """Compare a grid with the truth.
 
     T_sl : (4, 4), grid's level frame to the scene's
@@ -181,13 +181,13 @@ def score(grid: Grid, scene: Scene, T_sl: np.ndarray, points: Iterable[np.ndarra
     )
 
 
-def _special(grid: Grid, scene: Scene, T_sl: np.ndarray, band: tuple[float, float], outline: np.ndarray) -> dict[str, dict[str, int]]:
+def _special(grid: Grid, scene: TrueRoom, T_sl: np.ndarray, band: tuple[float, float], outline: np.ndarray) -> dict[str, dict[str, int]]:
     """Count the states of the cells that lie on each special box for more than half, and its seen outline as `outline_is_occupied` does."""
     counts = {}
     occupied = grid.state == OCCUPIED
     for solid in scene.solids:
         if solid["name"] in SPECIAL:
-            share = sample(grid, Scene(np.full(3, -np.inf), np.full(3, np.inf), [solid]), T_sl, band).mean(axis=-1)
+            share = sample(grid, TrueRoom(np.full(3, -np.inf), np.full(3, np.inf), [solid]), T_sl, band).mean(axis=-1)
             states, seen_there = grid.state[share > 0.5], outline & (share > 0.0)
             counts[solid["name"]] = {
                 "cells": len(states), "occupied": int((states == OCCUPIED).sum()), "free": int((states == FREE).sum()),
@@ -197,7 +197,7 @@ def _special(grid: Grid, scene: Scene, T_sl: np.ndarray, band: tuple[float, floa
     return counts
 
 
-def sample(grid: Grid, scene: Scene, T_sl: np.ndarray, band: tuple[float, float]) -> np.ndarray:
+def sample(grid: Grid, scene: TrueRoom, T_sl: np.ndarray, band: tuple[float, float]) -> np.ndarray:
     """Say for the samples of each cell (H, W, 25) whether something of the band is there."""
     rows, columns = grid.state.shape
     sub = (np.arange(SUBCELLS) + 0.5) / SUBCELLS

@@ -34,7 +34,7 @@ UPRIGHT = 0.5  # cosine of a wall's normal to the vertical at most
 
 
 @dataclass(frozen=True)
-class View:
+class FrameSurface:
     """What one frame shows, and from where."""
 
     T_lc: np.ndarray  # (4, 4) camera to level frame
@@ -53,7 +53,7 @@ class View:
 
 
 @dataclass(frozen=True)
-class Evidence:
+class MapEvidence:
     """The figures a verdict rests on."""
 
     free_area: float  # [m^2] of free cells
@@ -70,7 +70,7 @@ class Evidence:
     camera_pitch_deg: float  # [degrees] by which the camera looks down, median
 
 
-def measure(grid: Grid, T_lc: np.ndarray, views: Sequence[View], *, is_floor_found: bool, max_range: float) -> Evidence:
+def measure(grid: Grid, T_lc: np.ndarray, views: Sequence[FrameSurface], *, is_floor_found: bool, max_range: float) -> MapEvidence:
     """Measure what a map is worth to a robot.
 
     T_lc : (F, 4, 4) camera to level frame of every frame, NaN = lost
@@ -79,7 +79,7 @@ def measure(grid: Grid, T_lc: np.ndarray, views: Sequence[View], *, is_floor_fou
     """
     T_lc = T_lc[np.isfinite(T_lc[:, 0, 0])]
     twins = [twin for twin in (twin_distance(view, views) for view in views) if np.isfinite(twin)]
-    return Evidence(
+    return MapEvidence(
         free_area=float((grid.state == 0).sum() * grid.resolution**2),
         path_area=len(np.unique(np.floor(T_lc[:, :2, 3] / PATH_SQUARE), axis=0)) * PATH_SQUARE**2,
         path_known=known_share(grid, T_lc[:, :3, 3]),
@@ -104,7 +104,7 @@ def known_share(grid: Grid, xyz_l: np.ndarray) -> float:
     return float((grid.state[row[inside], column[inside]] >= 0).sum() / len(xyz_l))
 
 
-def sees_floor(view: View, *, max_range: float) -> bool:
+def sees_floor(view: FrameSurface, *, max_range: float) -> bool:
     """Tell whether a view shows enough of the floor, within `max_range` [m] of the camera, for the grid to learn from it."""
     sigma = np.sqrt(view.surface.variance)
     is_floor = (
@@ -115,7 +115,7 @@ def sees_floor(view: View, *, max_range: float) -> bool:
     return bool(is_floor.sum() >= LEAST_FLOOR * view.surface.row.size)
 
 
-def is_flat_wall(view: View, *, least: float = 0.9) -> bool:
+def is_flat_wall(view: FrameSurface, *, least: float = 0.9) -> bool:
     """Tell whether one upright plane holds at least the share `least` of what a view shows."""
     xyz, normal = view.xyz_l[::SAMPLED], view.normal_l[::SAMPLED]
     sigma = NOISE_SIGMAS * np.sqrt(view.surface.variance[::SAMPLED])
@@ -131,7 +131,7 @@ def is_flat_wall(view: View, *, least: float = 0.9) -> bool:
     return bool(on_plane.mean() >= least and abs(n[2]) < UPRIGHT)
 
 
-def twin_distance(view: View, others: Sequence[View]) -> float:
+def twin_distance(view: FrameSurface, others: Sequence[FrameSurface]) -> float:
     """Return how far in front of a surface some other view puts that same surface [m]; NaN where all agree with what the view sees.
 
     A view looks through the space between the camera and the surface it sees: where another view has a surface of the same direction
@@ -145,7 +145,7 @@ def twin_distance(view: View, others: Sequence[View]) -> float:
     return float(found)
 
 
-def compare(source: View, target: View) -> tuple[int, np.ndarray]:
+def compare(source: FrameSurface, target: FrameSurface) -> tuple[int, np.ndarray]:
     """Look at a view's points from another one; returns how many lie on the surface seen there, and how far in front the others are [m].
 
     Counted are points of a surface of the same direction, at most FARTHEST_TWIN in front of that seen.
@@ -165,7 +165,7 @@ def _compare(
     T_ts: f8[:, ::1],
     seen: icp_kernels.Points,
     met_by: icp_kernels.Points,
-    view: icp_kernels.View,
+    view: icp_kernels.PointImage,
     in_front: f8[::1],
     fitted: i8[::1],
 ) -> None:

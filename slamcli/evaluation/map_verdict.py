@@ -8,7 +8,7 @@ import numpy as np
 
 from slamcli.depth import icp
 from slamcli.evaluation import map_evidence
-from slamcli.evaluation.map_evidence import Evidence, View
+from slamcli.evaluation.map_evidence import FrameSurface, MapEvidence
 from slamcli.runs.run_directory import RunDir
 from slamcli.schema import Grid, Ground, Map, Moving, Tracks, frame_poses
 from slamcli.stages.depth_frames import depth_poses
@@ -30,7 +30,7 @@ DOWN = "tilt the camera down until the floor 1 to 2 m ahead is in the picture"
 
 
 @dataclass(frozen=True)
-class Finding:
+class MapFinding:
     """One thing that speaks against a map, with its remedy."""
 
     cause: str
@@ -46,8 +46,8 @@ class Finding:
 class Verdict:
     """What was measured of a map, and the reasons against it, the most telling first."""
 
-    evidence: Evidence
-    findings: tuple[Finding, ...]
+    evidence: MapEvidence
+    findings: tuple[MapFinding, ...]
 
     @property
     def is_usable(self) -> bool:
@@ -69,7 +69,7 @@ class Verdict:
         return {"is_usable": self.is_usable, **rounded, "findings": [asdict(finding) for finding in self.findings]}
 
 
-def judge(evidence: Evidence, *, max_range: float) -> Verdict:
+def judge(evidence: MapEvidence, *, max_range: float) -> Verdict:
     """Judge a map by what was measured of it.
 
     max_range : [m] to which the grid uses depth
@@ -84,53 +84,55 @@ def judge(evidence: Evidence, *, max_range: float) -> Verdict:
     return Verdict(evidence, (*_doubled(evidence), *why))
 
 
-def _doubled(e: Evidence) -> list[Finding]:
+def _doubled(e: MapEvidence) -> list[MapFinding]:
     if e.views_doubled <= MOST_DOUBLED * e.views:
         return []
     message = f"surfaces lie twice in the map, {e.doubled_by:.2f} m apart, in {e.views_doubled} of {e.views} views"
-    return [Finding(DOUBLED, message, "come back to where you began and look at it the same way for a while, so that the loop is closed")]
+    return [
+        MapFinding(DOUBLED, message, "come back to where you began and look at it the same way for a while, so that the loop is closed")
+    ]
 
 
-def _wall(e: Evidence) -> list[Finding]:
+def _wall(e: MapEvidence) -> list[MapFinding]:
     if e.views_of_a_wall <= MOST_WALL * e.views:
         return []
     message = f"a flat wall is all that {e.views_of_a_wall} of {e.views} views show"
-    return [Finding(WALL, message, "walk so that a corner and the floor are in view")]
+    return [MapFinding(WALL, message, "walk so that a corner and the floor are in view")]
 
 
-def _holes(e: Evidence) -> list[Finding]:
+def _holes(e: MapEvidence) -> list[MapFinding]:
     if e.missing <= MOST_MISSING:
         return []
     message = f"depth has {e.missing:.0%} holes"
-    return [Finding(HOLES, message, "keep 0.5 to 4 m away from what you record, and off glass, mirrors and sunlight")]
+    return [MapFinding(HOLES, message, "keep 0.5 to 4 m away from what you record, and off glass, mirrors and sunlight")]
 
 
-def _floor(e: Evidence, max_range: float) -> list[Finding]:
+def _floor(e: MapEvidence, max_range: float) -> list[MapFinding]:
     seen = f"floor seen in {e.views_with_floor} of {e.views} views"
     if e.views_with_floor == 0 or not e.is_floor_found:
         high = e.is_floor_found and e.camera_height >= HIGH_CAMERA
-        return [_too_high(e, seen, max_range) if high else Finding(NO_FLOOR, seen, DOWN)]
+        return [_too_high(e, seen, max_range) if high else MapFinding(NO_FLOOR, seen, DOWN)]
     if e.views_with_floor >= LEAST_FLOOR * e.views:
         return []
-    return [_too_high(e, seen, max_range) if e.camera_height >= HIGH_CAMERA else Finding(RARE_FLOOR, seen, DOWN)]
+    return [_too_high(e, seen, max_range) if e.camera_height >= HIGH_CAMERA else MapFinding(RARE_FLOOR, seen, DOWN)]
 
 
-def _too_high(e: Evidence, seen: str, max_range: float) -> Finding:
+def _too_high(e: MapEvidence, seen: str, max_range: float) -> MapFinding:
     tilt = math.degrees(math.asin(min(1.0, e.camera_height / (AIM * max_range))))
     high = f"the camera is {e.camera_height:.1f} m high and looks {e.camera_pitch_deg:.0f} degrees down: {seen} within {max_range:g} m"
-    return Finding(TOO_HIGH, high, f"carry it lower, or tilt it down by some {tilt:.0f} degrees")
+    return MapFinding(TOO_HIGH, high, f"carry it lower, or tilt it down by some {tilt:.0f} degrees")
 
 
-def _small(e: Evidence) -> Finding:
+def _small(e: MapEvidence) -> MapFinding:
     message = f"only {e.free_area:.1f} m2 of free floor, and the camera passed over {e.path_area:.1f} m2"
-    return Finding(SMALL, message, "walk through the room with the floor ahead in view")
+    return MapFinding(SMALL, message, "walk through the room with the floor ahead in view")
 
 
-def _path(e: Evidence) -> list[Finding]:
+def _path(e: MapEvidence) -> list[MapFinding]:
     if e.path_known >= LEAST_PATH:
         return []
     message = f"{1 - e.path_known:.0%} of the camera's path lie in space never seen, so no path can be planned from its start"
-    return [Finding(OFF_PATH, message, "look at the floor before you walk over it")]
+    return [MapFinding(OFF_PATH, message, "look at the floor before you walk over it")]
 
 
 def of_run(run: RunDir) -> Verdict | None:
@@ -145,13 +147,13 @@ def of_run(run: RunDir) -> Verdict | None:
     return judge(evidence, max_range=config.grid2d.max_range)
 
 
-def _views(run: RunDir, T_lw: np.ndarray) -> list[View]:
+def _views(run: RunDir, T_lw: np.ndarray) -> list[FrameSurface]:
     """Read frames spread over the recording, of those that have a pose and depth, without what moves: it is seen in several places."""
     (_, images), sensor = still(run, run.load(Moving, "loop")), run.config().sensor
     camera, given = run.camera("loop"), run.camera()
     poses = [(frame, T_lw @ T_wd) for frame, T_wd in depth_poses(run, frames="all") if images[frame].any()]
     rows = sorted({int(row) for row in np.linspace(0, len(poses) - 1, min(len(poses), map_evidence.MOST_VIEWS))})
     return [
-        View(T_lc, icp.surface_points(images[frame], camera, sensor, given=given), float((images[frame] == 0).mean()))
+        FrameSurface(T_lc, icp.surface_points(images[frame], camera, sensor, given=given), float((images[frame] == 0).mean()))
         for frame, T_lc in (poses[row] for row in rows)
     ]

@@ -29,7 +29,7 @@ class MapDifference:
 
 
 @dataclass(frozen=True)
-class Compared:
+class ComparedRun:
     """One run among those compared."""
 
     name: str
@@ -49,7 +49,7 @@ class Compared:
         return asdict(self) | {"coverage": self.located / max(self.frames, 1), "verdict": verdict}
 
 
-def compare(runs: Sequence[RunDir], names: Sequence[str]) -> list[Compared]:
+def compare(runs: Sequence[RunDir], names: Sequence[str]) -> list[ComparedRun]:
     """Compare runs of one recording, or of several, with the first of them; SlamError where one has no trajectory yet."""
     settings = differing_settings([_flat(asdict(run.config())) for run in runs])
     first = {stage: (runs[0].record(stage) or {}).get("digest") for stage in NAMES}
@@ -63,10 +63,10 @@ def differing_settings(configs: Sequence[dict[str, Any]]) -> list[dict[str, Any]
     return [{key: config.get(key) for key in keys} for config in configs]
 
 
-def _compared(run: RunDir, name: str, settings: dict[str, Any], first: dict[str, Any], reference: RunDir) -> Compared:
+def _compared(run: RunDir, name: str, settings: dict[str, Any], first: dict[str, Any], reference: RunDir) -> ComparedRun:
     records = {stage: record for stage in NAMES if (record := run.record(stage)) is not None}
     estimate = trajectory_error.stage_trajectory(run, trajectory_error.last_stage(run))
-    return Compared(
+    return ComparedRun(
         name=name,
         settings=settings,
         same_output=[stage for stage, record in records.items() if record["digest"] == first[stage]],
@@ -146,7 +146,7 @@ FIGURES = ("time [s]", "CPU time [s]", "APE RMSE [mm]", "frames located", "free 
            "grid cells flipped", "grid cells known to both", "cloud distance, median [mm]", "cloud distance, 95 % [mm]")  # fmt: skip
 
 
-def rows(compared: Sequence[Compared]) -> list[list[str]]:
+def rows(compared: Sequence[ComparedRun]) -> list[list[str]]:
     """Tabulate the runs: a row per option that differs and per figure, a column per run; the first row names them."""
     columns = [_column(one) for one in compared]
     table = [["", *(one.name for one in compared)]]
@@ -154,7 +154,7 @@ def rows(compared: Sequence[Compared]) -> list[list[str]]:
     return table + [[figure, *(column[i] for column in columns)] for i, figure in enumerate(FIGURES)]
 
 
-def _column(one: Compared) -> list[str]:
+def _column(one: ComparedRun) -> list[str]:
     causes = [finding.cause for finding in one.verdict.findings] if one.verdict is not None else []
     return [
         f"{one.seconds:.1f}",
@@ -167,7 +167,7 @@ def _column(one: Compared) -> list[str]:
     ]
 
 
-def _against_the_first(one: Compared) -> list[str]:
+def _against_the_first(one: ComparedRun) -> list[str]:
     found = one.difference
     if found is None:
         return ["-"] * 5

@@ -32,7 +32,7 @@ def write_g2o(
 
 
 @dataclass(frozen=True)
-class PoseGraph:
+class GraphFile:
     """A pose graph as a file holds it."""
 
     vertex: np.ndarray  # (K,) the file's vertex numbers, increasing
@@ -43,7 +43,7 @@ class PoseGraph:
     is_fixed: np.ndarray  # (K,) bool
 
 
-def read_g2o(path: Path) -> PoseGraph:
+def read_g2o(path: Path) -> GraphFile:
     """Read the SE(3) vertices and edges of a g2o text file; other lines are skipped. SlamError names file and line of what is wrong."""
     vertices, edges, fixed = {}, [], set()
     try:
@@ -75,7 +75,7 @@ def read_g2o(path: Path) -> PoseGraph:
     omega = np.zeros((len(edges), 6, 6))
     i, j = np.triu_indices(6)
     omega[:, i, j] = omega[:, j, i] = measured[:, 7:]
-    return PoseGraph(
+    return GraphFile(
         vertex=vertex,
         T_wk=se3.from_quaternion(pose[:, :3], pose[:, 3:]),
         edge_kf=np.array([[row[a], row[b]] for _, (a, b, *_) in edges], dtype=np.int64).reshape(-1, 2),

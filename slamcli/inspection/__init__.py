@@ -19,7 +19,7 @@ from slamcli.inspection.findings import (
     ERROR,
     NOTE,
     WARNING,
-    Finding,
+    RecordingFinding,
     about_colour,
     about_depth,
     about_files,
@@ -32,11 +32,11 @@ from slamcli.inspection.findings import (
     is_textured,
 )
 from slamcli.inspection.pictures import Pictures
-from slamcli.inspection.registration import Registration
-from slamcli.inspection.timing import Timing
+from slamcli.inspection.registration import RegistrationFinding
+from slamcli.inspection.timing import StampTiming
 from slamcli.slam import doubt
 
-__all__ = ["ERROR", "NOTE", "WARNING", "Finding", "Inspection", "doubts", "inspect", "quick_look"]
+__all__ = ["ERROR", "NOTE", "WARNING", "Inspection", "RecordingFinding", "doubts", "inspect", "quick_look"]
 
 QUICK_FRAMES, QUICK_BLOCKS = 30, 3  # looked at before a run: a second or two
 VERDICTS = {ERROR: "do not run it like this", WARNING: "usable, with the faults listed", NOTE: "good"}
@@ -47,7 +47,7 @@ class Inspection:
     """Everything that was found."""
 
     recording: str
-    findings: list[Finding]
+    findings: list[RecordingFinding]
     facts: dict[str, Any] = field(default_factory=dict)
 
     @property
@@ -85,7 +85,7 @@ def inspect(
     try:
         dataset = open_dataset(target, data=data, camera=camera, options=options, progress=progress)
     except SlamError as error:
-        return Inspection(target, [Finding(ERROR, "opening", str(error))])
+        return Inspection(target, [RecordingFinding(ERROR, "opening", str(error))])
     times = timing.judge(dataset)
     seen = pictures.look(dataset, workers=workers, progress=progress)
     unit = depth_unit.judge(seen.depth_counts, depth_unit.counting_scale(dataset.camera.depth_scale))
@@ -104,7 +104,7 @@ def inspect(
     return Inspection(str(dataset.root), findings, _facts(dataset, times, seen, unit, fit))
 
 
-def quick_look(dataset: Dataset, *, workers: int = 2) -> list[Finding]:
+def quick_look(dataset: Dataset, *, workers: int = 2) -> list[RecordingFinding]:
     """Look at some frames spread over a recording and list what would spoil a run; what its opening said is not repeated."""
     frames = spread(len(dataset), QUICK_FRAMES)
     seen = pictures.look(dataset, workers=workers, progress=silent, frames=frames)
@@ -118,7 +118,7 @@ def quick_look(dataset: Dataset, *, workers: int = 2) -> list[Finding]:
     return [finding for finding in findings if finding.level != NOTE]
 
 
-def _about_registration(dataset: Dataset, times: Timing, *, is_textured: bool, workers: int) -> list[Finding]:
+def _about_registration(dataset: Dataset, times: StampTiming, *, is_textured: bool, workers: int) -> list[RecordingFinding]:
     """Judge by a few stretches whether depth lies on colour; what they find, or are too few for, more of them must confirm."""
     for blocks in (QUICK_BLOCKS, registration.BLOCKS):
         fit = registration.measure(dataset, workers=workers, blocks=blocks)
@@ -128,7 +128,7 @@ def _about_registration(dataset: Dataset, times: Timing, *, is_textured: bool, w
     return found
 
 
-def doubts(findings: list[Finding]) -> list[doubt.Finding]:
+def doubts(findings: list[RecordingFinding]) -> list[doubt.Finding]:
     """Pick the finding on a recording that puts what is made of it in doubt as a whole, as a run keeps it: depth off colour, else late."""
     for check, name in (("registration", "registration"), ("time offset", "depth_delay")):
         found = [one for one in findings if one.check == check and one.level != NOTE]
@@ -137,7 +137,7 @@ def doubts(findings: list[Finding]) -> list[doubt.Finding]:
     return []
 
 
-def _facts(dataset: Dataset, times: Timing, seen: Pictures, unit: DepthUnit, fit: Registration) -> dict[str, Any]:
+def _facts(dataset: Dataset, times: StampTiming, seen: Pictures, unit: DepthUnit, fit: RegistrationFinding) -> dict[str, Any]:
     camera = dataset.camera
     return {
         "format": dataset.reader,

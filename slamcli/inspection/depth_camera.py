@@ -14,12 +14,12 @@ import numpy as np
 from scipy.optimize import minimize
 
 from slamcli.datasets import Dataset
-from slamcli.estimation.shared_parameters import Evidence
+from slamcli.estimation.shared_parameters import SharedEvidence
 from slamcli.geometry import se3
 from slamcli.geometry.camera import Camera
 from slamcli.geometry.depth_registration import Registration
 from slamcli.inspection import registration
-from slamcli.inspection.registration import Colours, Edges
+from slamcli.inspection.registration import ColourEdges, DepthEdges
 
 # All numbers of a depth camera: logarithm of the focal length, principal point [px], rotation vector [rad] and translation [m] of T_cd.
 FOCAL, CENTRE, TURN, OFFSET = 0, slice(1, 3), slice(3, 6), slice(6, 9)
@@ -119,7 +119,7 @@ class DepthCamera:
         camera = Camera(*size, self.focal, self.focal, cx, cy, depth_scale=colour.depth_scale)
         return Registration(camera, colour, transform(self.turn, self.offset))
 
-    def told_by(self, map_: Evidence) -> "DepthCamera":
+    def told_by(self, map_: SharedEvidence) -> "DepthCamera":
         """Return it with what a map that was made with it says of the same numbers, or as it is where both contradict one another.
 
         A depth camera that is bent by itself makes a map that calls for another turn and principal point than the edges do.
@@ -159,7 +159,7 @@ def _like_colour(camera: Camera) -> np.ndarray:
 class _Overlay:
     """Depth edges laid over the pictures nearest in time to them. `N` edges."""
 
-    def __init__(self, dataset: Dataset, colours: Colours, edges: Sequence[Edges], lag: float) -> None:
+    def __init__(self, dataset: Dataset, colours: ColourEdges, edges: Sequence[DepthEdges], lag: float) -> None:
         self._camera, self._colours, self._steepness, self._mean = dataset.camera, colours, colours.steepness, 1.0
         near = [(e, int(np.abs(colours.stamp - (e.stamp - lag)).argmin())) for e in edges]
         near = [(e, k) for e, k in near if abs(colours.stamp[k] - (e.stamp - lag)) <= registration.LONGEST_STEP]

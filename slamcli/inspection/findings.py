@@ -9,8 +9,8 @@ from slamcli.datasets import Dataset
 from slamcli.datasets.depth_unit import DepthUnit
 from slamcli.inspection import pictures, timing
 from slamcli.inspection.pictures import Pictures
-from slamcli.inspection.registration import Registration
-from slamcli.inspection.timing import Timing
+from slamcli.inspection.registration import RegistrationFinding
+from slamcli.inspection.timing import StampTiming
 from slamcli.slam import calibration_doubt, stream_doubt
 
 ERROR, WARNING, NOTE = "error", "warning", "note"
@@ -35,7 +35,7 @@ EXPECTED_LAG = (-0.02, 0.035)  # [s]; the stamps of the first Kinect's depth are
 
 
 @dataclass(frozen=True)
-class Finding:
+class RecordingFinding:
     """One thing found, in plain words, and what to do about it."""
 
     level: str
@@ -44,12 +44,12 @@ class Finding:
     advice: str = ""
 
 
-def about_lists(dataset: Dataset, times: Timing) -> list[Finding]:
+def about_lists(dataset: Dataset, times: StampTiming) -> list[RecordingFinding]:
     """Judge what opening the recording put right, gaps, and frames without a partner."""
     findings = [
-        Finding(NOTE, "size", message)
+        RecordingFinding(NOTE, "size", message)
         if REDUCED in message
-        else Finding(WARNING, "lists", message, "the program puts this right; mend the list to be rid of the warning")
+        else RecordingFinding(WARNING, "lists", message, "the program puts this right; mend the list to be rid of the warning")
         for message in dataset.warnings
         if "depth_scale" not in message and "hold no reading" not in message
     ]
@@ -58,7 +58,7 @@ def about_lists(dataset: Dataset, times: Timing) -> list[Finding]:
             start, length = max(gaps, key=lambda gap: gap[1])
             count = f"{len(gaps)} gaps" if len(gaps) > 1 else "a gap"
             findings.append(
-                Finding(
+                RecordingFinding(
                     WARNING,
                     "gaps",
                     f"{count} in {what}, the longest of {length:.2f} s, {start:.2f} s after the start",
@@ -68,7 +68,7 @@ def about_lists(dataset: Dataset, times: Timing) -> list[Finding]:
     n, n_with_depth = len(dataset), times.n_with_depth
     if n - n_with_depth > UNMATCHED * n:
         findings.append(
-            Finding(
+            RecordingFinding(
                 WARNING,
                 "unmatched",
                 f"{n - n_with_depth} of {n} colour frames have no depth image within {timing.MAX_DIFFERENCE:g} s",
@@ -76,17 +76,17 @@ def about_lists(dataset: Dataset, times: Timing) -> list[Finding]:
             )
         )
     if n < 30:
-        findings.append(Finding(NOTE, "length", f"only {n} frames", "a map of this little will be small"))
+        findings.append(RecordingFinding(NOTE, "length", f"only {n} frames", "a map of this little will be small"))
     return findings
 
 
-def about_order(dataset: Dataset, times: Timing, seen: Pictures) -> list[Finding]:
+def about_order(dataset: Dataset, times: StampTiming, seen: Pictures) -> list[RecordingFinding]:
     """Judge whether images follow one another as their stamps say."""
     findings = []
     if times.misnamed:
         first = times.misnamed[0]
         findings.append(
-            Finding(
+            RecordingFinding(
                 WARNING,
                 "order",
                 f"{len(times.misnamed)} frames have other stamps than their files' names say, the first is {dataset.colour_name[first]}",
@@ -101,7 +101,7 @@ def about_order(dataset: Dataset, times: Timing, seen: Pictures) -> list[Finding
     ):
         if len(found):
             findings.append(
-                Finding(
+                RecordingFinding(
                     WARNING,
                     "order",
                     f"{len(found)} {what} images do not follow from those before and after, the first is {paths[found[0]]}",
@@ -116,7 +116,7 @@ def _lit(seen: Pictures) -> np.ndarray:
     return np.where((seen.mean_grey < TOO_DARK)[:, None, None], np.float32(np.nan), seen.thumbnail)
 
 
-def about_files(dataset: Dataset, seen: Pictures) -> list[Finding]:
+def about_files(dataset: Dataset, seen: Pictures) -> list[RecordingFinding]:
     """Judge images that cannot be used."""
     if not seen.errors:
         return []
@@ -124,10 +124,10 @@ def about_files(dataset: Dataset, seen: Pictures) -> list[Finding]:
     worst = max(n_without_colour, len(seen.errors) - n_without_colour)  # colour, depth
     level = ERROR if worst > MANY_FRAMES * n_frames else WARNING
     more = f" and {len(seen.errors) - 1} more" if len(seen.errors) > 1 else ""
-    return [Finding(level, "files", f"{seen.errors[0]}{more}", "such frames are skipped; copy or unpack the recording again")]
+    return [RecordingFinding(level, "files", f"{seen.errors[0]}{more}", "such frames are skipped; copy or unpack the recording again")]
 
 
-def about_colour(seen: Pictures) -> list[Finding]:
+def about_colour(seen: Pictures) -> list[RecordingFinding]:
     """Judge blur, exposure and texture of the pictures."""
     findings = []
     burnt = (seen.saturated > BURNT_OUT) | (seen.mean_grey > TOO_BRIGHT)
@@ -149,38 +149,40 @@ def about_colour(seen: Pictures) -> list[Finding]:
         limit = 0.1 if check == "texture" else FEW_FRAMES
         if n > limit * known:
             level = ERROR if n > MANY_FRAMES * known else WARNING
-            findings.append(Finding(level, check, f"{n} of {known} colour images are {message}", advice))
+            findings.append(RecordingFinding(level, check, f"{n} of {known} colour images are {message}", advice))
     return findings
 
 
-def about_depth(dataset: Dataset, times: Timing, seen: Pictures) -> list[Finding]:
+def about_depth(dataset: Dataset, times: StampTiming, seen: Pictures) -> list[RecordingFinding]:
     """Judge holes and empty images of depth."""
     holes = seen.holes[np.isfinite(seen.holes)]
     is_empty = holes > EMPTY
     if not len(holes) or is_empty.all():
-        return [Finding(ERROR, "empty depth", "no depth image holds a reading", "check how depth was recorded; 16-bit PNG, 0 = none")]
+        return [
+            RecordingFinding(ERROR, "empty depth", "no depth image holds a reading", "check how depth was recorded; 16-bit PNG, 0 = none")
+        ]
     findings = []
     if is_empty.sum() > FEW_FRAMES * len(holes):
         level = ERROR if is_empty.mean() > MANY_FRAMES else WARNING
         message = f"{int(is_empty.sum())} of {len(holes)} depth images are empty"
-        findings.append(Finding(level, "empty depth", message, "something covered the camera, or the depth stream broke off"))
+        findings.append(RecordingFinding(level, "empty depth", message, "something covered the camera, or the depth stream broke off"))
     typical = float(np.median(holes[~is_empty]))
     if typical > HOLES:
         message = f"a typical depth image has no reading in {typical:.0%} of its pixels"
-        findings.append(Finding(WARNING, "holes", message, "too near, too far, glass, sunlight, or an image cut in half"))
+        findings.append(RecordingFinding(WARNING, "holes", message, "too near, too far, glass, sunlight, or an image cut in half"))
     elif seen.never_seen > NEVER_SEEN:
         message = f"{seen.never_seen:.0%} of the picture have no depth in any frame"
-        findings.append(Finding(WARNING, "holes", message, "depth may be registered to another camera or cut off"))
+        findings.append(RecordingFinding(WARNING, "holes", message, "depth may be registered to another camera or cut off"))
     return findings
 
 
-def about_streams(dataset: Dataset, seen: Pictures) -> list[Finding]:
+def about_streams(dataset: Dataset, seen: Pictures) -> list[RecordingFinding]:
     """Judge whether the images of all frames are what a camera sees: streams that stand still, depth without sense."""
     same = (np.append(False, (taken[1:] == taken[:-1]) & (taken[1:] >= 0)) for taken in (seen.picture_sum, seen.depth_sum))
     found = stream_doubt.about_motion(dataset.stamp, *same)
     if any(one is not None and one.share > 0 for one in seen.readings):  # else `about_depth` says so
         found += stream_doubt.about_readings(list(seen.readings))
-    return [Finding(ERROR if one.is_grave else WARNING, one.name.replace("_", " "), *one.text.split(": ", 1)) for one in found]
+    return [RecordingFinding(ERROR if one.is_grave else WARNING, one.name.replace("_", " "), *one.text.split(": ", 1)) for one in found]
 
 
 def is_textured(seen: Pictures) -> bool:
@@ -189,39 +191,43 @@ def is_textured(seen: Pictures) -> bool:
     return bool(len(known) and np.median(known) >= TEXTURED)
 
 
-def about_unit(dataset: Dataset, unit: DepthUnit) -> list[Finding]:
+def about_unit(dataset: Dataset, unit: DepthUnit) -> list[RecordingFinding]:
     """Judge the depth scale."""
     if unit.likely_scale is None:
         return []
     message = f"the depth scale {dataset.camera.depth_scale:g} is doubtful: {unit.reason}"
     level = WARNING if unit.q is not None and not unit.camera else ERROR  # a camera may be new
-    return [Finding(level, "depth scale", message, f"try: -s camera.depth_scale={unit.likely_scale:g}")]
+    return [RecordingFinding(level, "depth scale", message, f"try: -s camera.depth_scale={unit.likely_scale:g}")]
 
 
-def about_focal_length(dataset: Dataset, rigid: Rigidity | None) -> list[Finding]:
+def about_focal_length(dataset: Dataset, rigid: Rigidity | None) -> list[RecordingFinding]:
     """Judge the focal length."""
-    return [Finding(ERROR, "focal length", *one.text.split(": ", 1)) for one in calibration_doubt.about({}, rigid, dataset.camera)]
+    return [RecordingFinding(ERROR, "focal length", *one.text.split(": ", 1)) for one in calibration_doubt.about({}, rigid, dataset.camera)]
 
 
-def about_registration(dataset: Dataset, fit: Registration, times: Timing, *, is_textured: bool) -> list[Finding]:
+def about_registration(dataset: Dataset, fit: RegistrationFinding, times: StampTiming, *, is_textured: bool) -> list[RecordingFinding]:
     """Judge whether depth lies on colour, in place and in time."""
     findings = []
     camera = dataset.camera
     if fit.magnification is not None:
         message = f"depth does not lie on colour: its edges fit when it is enlarged {fit.magnification:.2f} times"
         advice = f"it seems to be in the pixels of a depth camera of focal length {camera.fx / fit.magnification:.0f} px: {DESCRIBE}"
-        findings.append(Finding(WARNING, "registration", message, advice))
+        findings.append(RecordingFinding(WARNING, "registration", message, advice))
     elif fit.shift is None and fit.n_points >= MANY_EDGES and is_textured:
         message = "the edges of depth meet those of colour nowhere: depth may not be registered, and the map's scale is then in doubt"
-        findings.append(Finding(WARNING, "registration", message, f"record depth registered to colour, or {DESCRIBE}"))
+        findings.append(RecordingFinding(WARNING, "registration", message, f"record depth registered to colour, or {DESCRIBE}"))
     elif fit.shift is not None and max(map(abs, fit.shift)) > max(SHIFT * dataset.camera.width, 2.0):
         message = f"depth does not lie on colour: its edges fit when moved by ({fit.shift[0]:+.0f}, {fit.shift[1]:+.0f}) px"
-        findings.append(Finding(WARNING, "registration", message, "register depth to the colour camera, with that camera's calibration"))
+        findings.append(
+            RecordingFinding(WARNING, "registration", message, "register depth to the colour camera, with that camera's calibration")
+        )
     if fit.lag is not None and not EXPECTED_LAG[0] <= fit.lag <= EXPECTED_LAG[1]:
         late = "late" if fit.lag > 0 else "early"
         message = f"depth stamps are {abs(fit.lag):.3f} s {late}: the edges of depth and colour meet only then"
-        findings.append(Finding(WARNING, "time offset", message, f"add {-fit.lag:+.3f} s to the stamps in the depth list"))
+        findings.append(RecordingFinding(WARNING, "time offset", message, f"add {-fit.lag:+.3f} s to the stamps in the depth list"))
     elif fit.lag is None and times.depth_names_offset is not None and abs(times.depth_names_offset) > 0.02:
         message = f"the depth stamps differ from their files' names by {times.depth_names_offset:+.3f} s"
-        findings.append(Finding(WARNING, "stamps", message, "the clock of depth was moved; restore the list unless that was meant"))
+        findings.append(
+            RecordingFinding(WARNING, "stamps", message, "the clock of depth was moved; restore the list unless that was meant")
+        )
     return findings

@@ -43,7 +43,7 @@ LARGEST_FLOW_SIDE = 320  # px; optical flow is computed on pictures reduced to t
 
 
 @dataclass(frozen=True)
-class Registration:
+class RegistrationFinding:
     """How depth lies on colour."""
 
     shift: tuple[float, float] | None  # (dx, dy) [px] by which depth must be moved to fit colour; None = cannot be told
@@ -57,7 +57,7 @@ class Registration:
 
 
 @dataclass(frozen=True)
-class Colours:
+class ColourEdges:
     """Pictures as edges see them: how steep they are along x and y, and how they move. `C` pictures."""
 
     stamp: np.ndarray  # (C,) float64 [s]
@@ -67,7 +67,7 @@ class Colours:
 
 
 @dataclass(frozen=True)
-class Edges:
+class DepthEdges:
     """Depth edges of one frame."""
 
     stamp: float
@@ -76,17 +76,17 @@ class Edges:
     depth: np.ndarray  # (N,) float32 [m] of the nearer side
     outward: np.ndarray  # (N,) float32, +1 where the farther side is the one with the larger coordinate, else -1
 
-    def thinned(self, step: int) -> "Edges":
+    def thinned(self, step: int) -> "DepthEdges":
         """Return every `step`-th of them."""
-        return Edges(self.stamp, self.xy[::step], self.is_along_y[::step], self.depth[::step], self.outward[::step])
+        return DepthEdges(self.stamp, self.xy[::step], self.is_along_y[::step], self.depth[::step], self.outward[::step])
 
 
-def measure(dataset: Dataset, *, workers: int, blocks: int = BLOCKS) -> Registration:
+def measure(dataset: Dataset, *, workers: int, blocks: int = BLOCKS) -> RegistrationFinding:
     """Measure shift and lag of a recording's depth in so many stretches of consecutive frames."""
     colours, edges = collect(dataset, workers, blocks)
     n_points = sum(len(e.xy) for e in edges)
     if n_points < LEAST_POINTS or len(colours.stamp) < 3:
-        return Registration(None, None, n_points, None, 1.0, 1.0)
+        return RegistrationFinding(None, None, n_points, None, 1.0, 1.0)
     lag = _first_guess(colours, edges)
     shift, _ = _best_shift(colours, edges, lag)
     lag, _ = _best_lag(colours, edges, shift)
@@ -94,7 +94,7 @@ def measure(dataset: Dataset, *, workers: int, blocks: int = BLOCKS) -> Registra
     lag, lag_contrast = _best_lag(colours, edges, shift)
     shift, shift_contrast = _best_shift(colours, edges, lag)
     is_shift_sure, is_lag_sure = shift_contrast >= LEAST_CONTRAST, lag_contrast >= LEAST_LAG_CONTRAST or not is_plain
-    return Registration(
+    return RegistrationFinding(
         shift=(float(shift[0]), float(shift[1])) if is_shift_sure else None,
         lag=round(lag, 4) if is_shift_sure and is_lag_sure else None,
         n_points=n_points,
@@ -106,7 +106,7 @@ def measure(dataset: Dataset, *, workers: int, blocks: int = BLOCKS) -> Registra
     )
 
 
-def collect(dataset: Dataset, workers: int, blocks: int) -> tuple[Colours, list[Edges]]:
+def collect(dataset: Dataset, workers: int, blocks: int) -> tuple[ColourEdges, list[DepthEdges]]:
     """Read stretches of consecutive frames spread over the recording: their pictures' steepness and motion, and their depth edges."""
     n = len(dataset)
     starts = np.unique(np.linspace(0, max(n - BLOCK_FRAMES, 0), blocks).astype(int))
@@ -124,7 +124,7 @@ def collect(dataset: Dataset, workers: int, blocks: int) -> tuple[Colours, list[
     steepness = np.empty(size, dtype=np.uint8)
     for k, pair in enumerate(ordered_map(lambda i: _steepness(greys[i]), used, workers=workers)):
         steepness[0, k], steepness[1, k] = pair
-    colours = Colours(np.array(dataset.stamp[used]), steepness, list(ordered_map(velocity_of, used, workers=workers)), reduction)
+    colours = ColourEdges(np.array(dataset.stamp[used]), steepness, list(ordered_map(velocity_of, used, workers=workers)), reduction)
     rng = np.random.default_rng(0)
     depths = zip(wanted_depth, ordered_map(partial(_try, dataset.depth), wanted_depth, workers=workers), strict=True)
     return colours, [_depth_edges(depth, float(dataset.depth_stamp[i]), rng) for i, depth in depths if depth is not None]
@@ -152,7 +152,7 @@ def _velocity(grey: np.ndarray, following: np.ndarray, seconds: float, reduction
     return flow * np.float32(reduction / max(seconds, 1e-3))
 
 
-def _depth_edges(depth: np.ndarray, stamp: float, rng: np.random.Generator) -> Edges:
+def _depth_edges(depth: np.ndarray, stamp: float, rng: np.random.Generator) -> DepthEdges:
     """Find depth jumps along rows and columns, from both sides so that their offsets cancel."""
     points, flags, depths, outward = [], [], [], []
     margin = LARGEST_SHIFT + 2
@@ -171,7 +171,9 @@ def _depth_edges(depth: np.ndarray, stamp: float, rng: np.random.Generator) -> E
             flags.append(np.full(len(inside), not along_x))
             depths.append(ahead[row, column][inside])
             outward.append(np.full(len(inside), sign, dtype=np.float32))
-    return Edges(stamp, np.concatenate(points).astype(np.float32), np.concatenate(flags), np.concatenate(depths), np.concatenate(outward))
+    return DepthEdges(
+        stamp, np.concatenate(points).astype(np.float32), np.concatenate(flags), np.concatenate(depths), np.concatenate(outward)
+    )
 
 
 def _jumps(lines: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -189,7 +191,7 @@ def _jumps(lines: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return row, at, np.minimum(0.5 * gap[row, at], LARGEST_LOSS)
 
 
-def _at_lag(colours: Colours, edges: list[Edges], lag: float) -> np.ndarray:
+def _at_lag(colours: ColourEdges, edges: list[DepthEdges], lag: float) -> np.ndarray:
     """Move every depth edge to the time of the picture nearest to its true time; give its place in that picture's steepness, (N,) int64."""
     _, n, height, width = colours.steepness.shape
     places = []
@@ -208,12 +210,12 @@ def _at_lag(colours: Colours, edges: list[Edges], lag: float) -> np.ndarray:
     return np.concatenate(places) if places else np.empty(0, dtype=np.int64)
 
 
-def _score(colours: Colours, places: np.ndarray, dx: int, dy: int) -> float:
+def _score(colours: ColourEdges, places: np.ndarray, dx: int, dy: int) -> float:
     """Return the mean steepness under the edges when moved by (dx, dy) [px]."""
     return float(colours.steepness.reshape(-1)[places + (dy * colours.steepness.shape[3] + dx)].mean()) if len(places) else 0.0
 
 
-def _first_guess(colours: Colours, edges: list[Edges]) -> float:
+def _first_guess(colours: ColourEdges, edges: list[DepthEdges]) -> float:
     """Find the lag near which the best shift is best, on a coarse lattice and a part of the points: far off, neither is found alone."""
     few = [e.thinned(THINNING) for e in edges]
     best = {}
@@ -223,7 +225,7 @@ def _first_guess(colours: Colours, edges: list[Edges]) -> float:
     return max(best, key=best.__getitem__)
 
 
-def _best_shift(colours: Colours, edges: list[Edges], lag: float) -> tuple[tuple[int, int], float]:
+def _best_shift(colours: ColourEdges, edges: list[DepthEdges], lag: float) -> tuple[tuple[int, int], float]:
     places = _at_lag(colours, edges, lag)
     coarse = {(dx, dy): _score(colours, places, dx, dy) for dx in _steps(3) for dy in _steps(3)}
     x, y = max(coarse, key=coarse.__getitem__)
@@ -232,7 +234,7 @@ def _best_shift(colours: Colours, edges: list[Edges], lag: float) -> tuple[tuple
     return best, fine[best] / max(float(np.mean(list(coarse.values()))), 1e-9)
 
 
-def magnification_of(dataset: Dataset, colours: Colours, edges: list[Edges]) -> float | None:
+def magnification_of(dataset: Dataset, colours: ColourEdges, edges: list[DepthEdges]) -> float | None:
     """Find the magnification under which depth edges lie on the picture's, where that is clear and not 1."""
     height, width = colours.steepness.shape[2:]
     centre = np.array([dataset.camera.cx, dataset.camera.cy], dtype=np.float32)
@@ -242,7 +244,7 @@ def magnification_of(dataset: Dataset, colours: Colours, edges: list[Edges]) -> 
         for e in edges:
             xy = centre + np.float32(factor) * (e.xy[::2] - centre)
             inside = ((xy > LARGEST_SHIFT) & (xy < np.array([width, height]) - 1 - LARGEST_SHIFT)).all(axis=1)
-            moved.append(Edges(e.stamp, xy[inside], e.is_along_y[::2][inside], e.depth[::2][inside], e.outward[::2][inside]))
+            moved.append(DepthEdges(e.stamp, xy[inside], e.is_along_y[::2][inside], e.depth[::2][inside], e.outward[::2][inside]))
         places = _at_lag(colours, moved, 0.0)
         if len(places) >= LEAST_POINTS:
             scores = [_score(colours, places, dx, dy) for dx in _steps(3) for dy in _steps(3)]
@@ -254,7 +256,7 @@ def magnification_of(dataset: Dataset, colours: Colours, edges: list[Edges]) -> 
     return float(best) if is_inside and is_clear and abs(best - 1.0) > NOT_ONE else None
 
 
-def _refine(colours: Colours, edges: list[Edges], shift: tuple[int, int], lag: float) -> tuple[tuple[int, int], float]:
+def _refine(colours: ColourEdges, edges: list[DepthEdges], shift: tuple[int, int], lag: float) -> tuple[tuple[int, int], float]:
     """Search both together nearby: while the picture moves one way, a shift passes for a lag, and one at a time they stop half-way."""
     found = {}
     for t in LAGS[np.abs(LAGS - lag) < 0.0301]:
@@ -269,7 +271,7 @@ def _refine(colours: Colours, edges: list[Edges], shift: tuple[int, int], lag: f
     return max(found, key=found.__getitem__)
 
 
-def _or_plainer(colours: Colours, edges: list[Edges], shift: tuple[int, int], lag: float) -> tuple[tuple[int, int], float, bool]:
+def _or_plainer(colours: ColourEdges, edges: list[DepthEdges], shift: tuple[int, int], lag: float) -> tuple[tuple[int, int], float, bool]:
     """Return the plainest shift and lag that fit about as well as those found: of a sound recording, else of one that is late alone.
 
     Many pairs fit nearly as well while the picture moves evenly, and the search may end at any of them. The flag says whether they are
@@ -294,7 +296,7 @@ def _steps(step: int) -> range:
     return range(-reach, reach + 1, step)
 
 
-def _best_lag(colours: Colours, edges: list[Edges], shift: tuple[int, int]) -> tuple[float, float]:
+def _best_lag(colours: ColourEdges, edges: list[DepthEdges], shift: tuple[int, int]) -> tuple[float, float]:
     scores = np.array([_score(colours, _at_lag(colours, edges, lag), *shift) for lag in LAGS])
     scores = np.convolve(np.pad(scores, 1, mode="edge"), [0.25, 0.5, 0.25], mode="valid")
     best = int(scores.argmax())

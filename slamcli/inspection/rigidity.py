@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from slamcli.calibration import plausibility
-from slamcli.calibration.plausibility import Rigidity, Seen
+from slamcli.calibration.plausibility import Rigidity, SeenTwice
 from slamcli.config.options import SensorConfig
 from slamcli.datasets import Dataset
 from slamcli.datasets.recording import spread
@@ -24,7 +24,7 @@ def measure(dataset: Dataset) -> Rigidity | None:
     return found if found is not None and found.pairs >= LEAST_PAIRS else None
 
 
-def _pairs(dataset: Dataset) -> Iterator[tuple[Seen, Seen]]:
+def _pairs(dataset: Dataset) -> Iterator[tuple[SeenTwice, SeenTwice]]:
     """Match the pictures of each pair."""
     later = np.searchsorted(dataset.stamp, dataset.stamp + APART)
     for i in spread(int((later < len(dataset)).sum()), PAIRS):
@@ -35,14 +35,14 @@ def _pairs(dataset: Dataset) -> Iterator[tuple[Seen, Seen]]:
         if first is not None and second is not None:
             (a, of_a), (b, of_b) = first, second
             rows, _ = hamming.match_brute(hamming.Described(a.desc, a.angle), hamming.Described(b.desc, b.angle))
-            yield Seen(of_a.xy[rows[:, 0]], of_a.depth[rows[:, 0]]), Seen(of_b.xy[rows[:, 1]], of_b.depth[rows[:, 1]])
+            yield SeenTwice(of_a.xy[rows[:, 0]], of_a.depth[rows[:, 0]]), SeenTwice(of_b.xy[rows[:, 1]], of_b.depth[rows[:, 1]])
 
 
-def _look(dataset: Dataset, i: int) -> tuple[orb.KeyPoints, Seen] | None:
+def _look(dataset: Dataset, i: int) -> tuple[orb.KeyPoints, SeenTwice] | None:
     """Detect the features of a frame and read their depth; None where it has no depth or nothing to see."""
     depth = dataset.depth(i)
     points = orb.detect(dataset.grey(i))
     if depth is None or len(points) == 0:
         return None
-    seen = Seen(dataset.camera.undistort(points.xy.astype(np.float64)), at_key_points.depth_at(depth, points.xy).astype(np.float64))
+    seen = SeenTwice(dataset.camera.undistort(points.xy.astype(np.float64)), at_key_points.depth_at(depth, points.xy).astype(np.float64))
     return points, seen

@@ -16,7 +16,7 @@ OFFSET_EDGES = np.linspace(-MAX_DIFFERENCE, MAX_DIFFERENCE, 9)  # [s]
 
 
 @dataclass(frozen=True)
-class Timing:
+class StampTiming:
     """What the stamps say."""
 
     duration: float  # [s]
@@ -31,7 +31,7 @@ class Timing:
     depth_names_offset: float | None  # [s] by which depth stamps are later than the file names say
 
 
-def judge(dataset: Dataset) -> Timing:
+def judge(dataset: Dataset) -> StampTiming:
     """Judge the stamps of a recording."""
     stamp, depth_stamp = dataset.stamp, dataset.depth_stamp
     has_depth = np.isfinite(depth_stamp)
@@ -40,7 +40,7 @@ def judge(dataset: Dataset) -> Timing:
     period = float(np.median(np.diff(stamp))) if len(stamp) > 1 else 0.0
     colour_misnamed, _ = _compare_names(stamp, dataset.colour_name)
     depth_misnamed, depth_offset = _compare_names(depth_stamp, dataset.depth_name)
-    return Timing(
+    return StampTiming(
         duration=float(stamp[-1] - stamp[0]),
         rate=1.0 / period if period > 0 else 0.0,
         gaps=_gaps(stamp, stamp[0]),

@@ -31,7 +31,7 @@ class Card:
 
 
 @dataclass(frozen=True)
-class Table:
+class TextTable:
     """A table of texts."""
 
     heading: list[str]
@@ -142,7 +142,7 @@ def _count(name: str, value: int | None) -> Card | None:
     return None if value is None else Card(name, thousands(value))
 
 
-def _errors(content: Content) -> Table | None:
+def _errors(content: Content) -> TextTable | None:
     """Tabulate the error after each stage."""
     rows = []
     for stage, ape in [*content.ape.items(), *((one.name, one) for one in content.ape_of)]:
@@ -151,10 +151,10 @@ def _errors(content: Content) -> Table | None:
         cells += [f"{figures['n_poses']} / {figures['n_frames']}", f"{figures['scale']:.4f}", f"{figures['rmse_scaled']:.4f}"]
         rows.append([stage, *cells])
     heading = ["after", "RMSE [m]", "mean", "median", "std", "max", "poses", "scale", "RMSE scaled"]
-    return Table(heading, rows) if rows else None
+    return TextTable(heading, rows) if rows else None
 
 
-def _timings(content: Content) -> tuple[list[Bar], Table]:
+def _timings(content: Content) -> tuple[list[Bar], TextTable]:
     """Tabulate what each stage cost; compiling kernels, which happens once on a machine, is kept apart."""
     records = {stage: state.record for stage, state in content.states.items() if state.record}
     compiling = {stage: record.get("compile_seconds", 0.0) for stage, record in records.items()}
@@ -169,7 +169,7 @@ def _timings(content: Content) -> tuple[list[Bar], Table]:
         rows.append([f"\u25a0 {stage}", content.states[stage].state, *cells, ", ".join(counts(record.get("summary", {})))])
     sums = [f"{total:.2f}", f"{sum(cpu.values()):.2f}", f"{sum(compiling.values()):.2f}", f"{n / total:.1f}"]
     rows.append(["total", "", *sums, "", f"{1000 * sum(cpu.values()) / n:.0f} ms CPU time a frame"])
-    return bars, Table(["stage", "state", "seconds", "CPU seconds", "compiling", "frames/s", "peak MiB", "counts"], rows)
+    return bars, TextTable(["stage", "state", "seconds", "CPU seconds", "compiling", "frames/s", "peak MiB", "counts"], rows)
 
 
 def _configuration(content: Content) -> list[Used]:

@@ -19,7 +19,7 @@ from slamcli.schema import Features, Grid, Moving
 from slamcli.stages import moving_parts
 from slamcli.visualization import grid_picture, moving_tint, render
 
-VIEW = render.View(width=1200, height=800)
+VIEW = render.Viewpoint(width=1200, height=800)
 MOST_POINTS = 3_000_000  # of a cloud that is drawn
 JPEG_QUALITY = 88
 ROBOT_RADIUS = 0.2  # [m]

@@ -52,5 +52,5 @@ class RunSurface:
             return densify.AS_RECORDED
         return densify.find_colours(self._depths, console.progress(self._poses, "colours"), self._config.sensor, self._option)
 
-    def _views(self, name: str) -> Iterator[densify.View]:
+    def _views(self, name: str) -> Iterator[densify.KeyFrameView]:
         return densify.views(self._depths, console.progress(self._poses, name), self._config.sensor, self._option)

@@ -20,7 +20,7 @@ from slamcli.runs.places import RECORDINGS
 from slamcli.runs.run_directory import RunDir, open_recording
 from slamcli.slam.doubt import Finding
 from slamcli.stages import NAMES, STAGES, Stage
-from slamcli.stages.joining import JOINS, Part
+from slamcli.stages.joining import JOINS, RecordingPart
 
 LAST = list(JOINS)[-1]  # stage of a recording's own run
 MOST = 1000  # recordings of a run
@@ -66,7 +66,7 @@ class PipelineOfSeveral(Pipeline):
                 costs += self._update(own, recording, stage, entry["name"])
             record = own.record(stage.name)
             assert record is not None, "it was brought up to date"
-            parts.append(Part(entry["name"], own, record["summary"]))
+            parts.append(RecordingPart(entry["name"], own, record["summary"]))
         return Begun(
             partial(JOINS[stage.name], parts),
             seconds=sum(record["seconds"] for record in costs),

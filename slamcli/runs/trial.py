@@ -5,7 +5,7 @@ from slamcli.calibration.self_calibration import Sensing
 from slamcli.config.options import Config
 from slamcli.datasets import Dataset
 from slamcli.errors import SlamError
-from slamcli.estimation.shared_parameters import Evidence
+from slamcli.estimation.shared_parameters import SharedEvidence
 from slamcli.files import scratch
 from slamcli.geometry.depth_registration import Registration
 from slamcli.runs.pipeline import Pipeline
@@ -15,7 +15,7 @@ from slamcli.sparse_map.sparse_map import SparseMap
 from slamcli.stages import measurements
 
 
-def registration_evidence(recording: Dataset, config: Config, given: Registration) -> Evidence | None:
+def registration_evidence(recording: Dataset, config: Config, given: Registration) -> SharedEvidence | None:
     """Map a recording in a folder that is removed again, and ask that map about the registration `given` with which its depth was read.
 
     None where no map came about.

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import b1, f4, f8
 
-from slamcli.depth.icp_kernels import Points, View
+from slamcli.depth.icp_kernels import PointImage, Points
 from slamcli.geometry import depth_noise
 from slamcli.geometry.depth_noise import DepthNoise
 from slamcli.jit.kernel import kernel
@@ -16,7 +16,7 @@ LEAST_COSINE = 0.25  # of a surface seen more slantingly, that its area is divid
 SAME_NORMAL = 0.8  # cosine between the normals of points on one surface
 
 
-class Matches(NamedTuple):
+class Correspondences(NamedTuple):
     """N points of the reference, and where the frame sees them."""
 
     x_r: f8[:, ::1]  # (N, 3) [m]
@@ -28,7 +28,7 @@ class Matches(NamedTuple):
 
 
 @kernel
-def vote(T: f8[:, :, ::1], matches: Matches, pinhole: f8[::1], chi2: f8, agrees: b1[::1]):
+def vote(T: f8[:, :, ::1], matches: Correspondences, pinhole: f8[::1], chi2: f8, agrees: b1[::1]):
     """Find the motion T (M, 3 or 4, 4) with which matches of the greatest total weight agree; write these; return its number and the weight.
 
     The better a match agrees, the more of its weight counts (P. Torr, A. Zisserman, CVIU 2000, doi:10.1006/cviu.1999.0832).
@@ -87,7 +87,7 @@ def _area(xyz, normal, pinhole, j):
 
 
 @kernel
-def explain(T: f8[:, ::1], reference: Points, frame: Points, view: View, flatness: DepthNoise):
+def explain(T: f8[:, ::1], reference: Points, frame: Points, view: PointImage, flatness: DepthNoise):
     """Sum the surface [m^2] of the reference that the frame shows in the same place under T (4, 4), and what it looks through.
 
     view : of the frame; surfaces are the same up to `flatness`

@@ -201,10 +201,10 @@ class StepFinder:
         return self._frame_points[frame]
 
 
-def _votes(common: Common, rows: np.ndarray) -> kernels.Matches:
+def _votes(common: Common, rows: np.ndarray) -> kernels.Correspondences:
     """Return matches `rows` as the voting kernel takes them."""
     m = common.measured.take(rows)
-    return kernels.Matches(common.x_r[rows], m.xy, m.depth, 1.0 / m.sigma_px, 1.0 / m.sigma_z, common.weight[rows])
+    return kernels.Correspondences(common.x_r[rows], m.xy, m.depth, 1.0 / m.sigma_px, 1.0 / m.sigma_z, common.weight[rows])
 
 
 def _score(one: Judgement) -> float:

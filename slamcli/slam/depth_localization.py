@@ -10,7 +10,7 @@ from slamcli.depth import icp
 from slamcli.depth.icp import PosePrior
 from slamcli.geometry import se3
 from slamcli.slam import background_prior
-from slamcli.slam.depth_tracking import DepthAligner, Placement
+from slamcli.slam.depth_tracking import DepthAligner, DepthPlacement
 from slamcli.slam.frame_poses import STEADY_INFORMATION, FramePoses
 from slamcli.slam.local_map import LocalMap, MapMatch
 from slamcli.sparse_map.guided_matching import FrameFeatures
@@ -25,7 +25,7 @@ SEARCH_SECONDS = 2.0  # after so long without a pose, what looks like the depth 
 class DepthMatch:
     """Where depth places a frame, and the landmarks that agree."""
 
-    placement: Placement
+    placement: DepthPlacement
     landmark: np.ndarray  # (N,) int32, of each feature of the frame, -1 = none
     is_anchored: bool  # whether every direction of motion was measured; else the frame before lent some
 
@@ -77,14 +77,14 @@ class DepthLocalizer:
         landmark = np.full(len(frame), -1, dtype=np.int32) if few is None else few.landmark
         return DepthMatch(placed, landmark, is_anchored)
 
-    def _confirm(self, i: int, found: MapMatch) -> Placement | None:
+    def _confirm(self, i: int, found: MapMatch) -> DepthPlacement | None:
         """Align frame `i` from the pose that landmarks give, which counts as measured too."""
         estimate = found.estimate
         return self._aligner.place(
             i, int(self._poses.ref_kf[self._poses.latest]), [estimate.T_cw], PosePrior(estimate.T_cw, estimate.information)
         )
 
-    def _search(self, i: int, frame: FrameFeatures, expected: np.ndarray) -> Placement | None:
+    def _search(self, i: int, frame: FrameFeatures, expected: np.ndarray) -> DepthPlacement | None:
         """Align frame `i` with one key frame after the other, until one determines its pose; else return the best placement.
 
         First the reference of the frame before, then a key frame made of that frame: it shows most of what frame `i` does, and the less
@@ -105,7 +105,7 @@ class DepthLocalizer:
             best = self._place(i, frame, kf, starts, best)
         return best
 
-    def _place(self, i: int, frame: FrameFeatures, kf: int, starts: list[np.ndarray], best: Placement | None) -> Placement | None:
+    def _place(self, i: int, frame: FrameFeatures, kf: int, starts: list[np.ndarray], best: DepthPlacement | None) -> DepthPlacement | None:
         """Align frame `i` with key frame `kf`, helped by landmarks where depth leaves directions open; returns the better of this and `best`.
 
         starts : T_cw, the first as expected, which counts as measured where the background's motion says so
@@ -118,7 +118,7 @@ class DepthLocalizer:
         is_better = placed is not None and placed.is_sound and (best is None or placed.n_determined > best.n_determined)
         return placed if is_better else best
 
-    def _match_few(self, frame: FrameFeatures, placed: Placement) -> MapMatch | None:
+    def _match_few(self, frame: FrameFeatures, placed: DepthPlacement) -> MapMatch | None:
         """Search the frame for the landmarks around the key frame it was aligned with; None where fewer than a few agree, or depth does not."""
         around = self._sparse_map.landmarks_in(np.append(self._sparse_map.joined_by_edges(np.array([placed.kf])), placed.kf))
         if len(around) == 0 or len(frame) < FEW:
@@ -127,5 +127,5 @@ class DepthLocalizer:
         return found if found is not None and placed.fits(found.estimate.T_cw) else None
 
 
-def _is_determined(placed: Placement | None) -> bool:
+def _is_determined(placed: DepthPlacement | None) -> bool:
     return placed is not None and placed.n_determined == icp.DIRECTIONS

@@ -67,7 +67,7 @@ NO_FRAME_POINTS = NoFramePoints()
 
 
 @dataclass(frozen=True)
-class Placement:
+class DepthPlacement:
     """Where a frame stands by depth ICP, and the evidence."""
 
     T_cw: np.ndarray  # (4, 4)
@@ -93,7 +93,7 @@ class DepthAligner:
         """Take the map with the points of the recording it is of, and those of the recording whose frames are placed."""
         self._sparse_map, self._map_frame_points, self._frame_points = sparse_map, map_frame_points, frame_points
 
-    def place(self, frame: int, kf: int, starts: list[np.ndarray], prior: PosePrior | None = None) -> Placement | None:
+    def place(self, frame: int, kf: int, starts: list[np.ndarray], prior: PosePrior | None = None) -> DepthPlacement | None:
         """Align a frame with key frame `kf` from the first of the poses `starts` (T_cw) that leads to a sound placement.
 
         prior : of T_cw. None where depth is missing.
@@ -107,7 +107,7 @@ class DepthAligner:
         for T_cw in starts:
             found = icp.align(product(T_cw, T_wk), source, target, prior=relative)
             information = found.information + (0.0 if prior is None else prior.information)
-            candidate = Placement(product(found.T_ij, se3.inverse(T_wk)), kf, found, icp.n_determined(information, found.depth))
+            candidate = DepthPlacement(product(found.T_ij, se3.inverse(T_wk)), kf, found, icp.n_determined(information, found.depth))
             if placement is None or candidate.alignment.agreement > placement.alignment.agreement:
                 placement = candidate
             if placement.is_sound:

@@ -9,7 +9,7 @@ from slamcli.config.options import TrackConfig
 from slamcli.schema import ON_DEPTH, RELOCALIZED, TRACKED, Tracks
 from slamcli.slam import background_prior, initial_pose
 from slamcli.slam.depth_localization import DepthLocalizer, DepthMatch
-from slamcli.slam.depth_tracking import NO_FRAME_POINTS, DepthAligner, FramePoints, Placement
+from slamcli.slam.depth_tracking import NO_FRAME_POINTS, DepthAligner, DepthPlacement, FramePoints
 from slamcli.slam.frame_poses import FramePoses
 from slamcli.slam.initial_pose import PreviousFrame
 from slamcli.slam.local_map import LocalMap, MapMatch
@@ -38,7 +38,7 @@ class Location:
     """What holds a frame in the map."""
 
     landmark: np.ndarray  # (N,) int32, of each feature of the frame, -1 = none
-    placement: Placement | None  # by depth ICP, where landmarks did not suffice
+    placement: DepthPlacement | None  # by depth ICP, where landmarks did not suffice
 
 
 class Localizer:

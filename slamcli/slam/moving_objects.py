@@ -22,7 +22,7 @@ from slamcli.schema import Features
 from slamcli.slam import moving_object_kernels as kernels
 from slamcli.slam import standing_objects
 from slamcli.slam.depth_views import STEP, Views, seen_from, shape
-from slamcli.slam.standing_objects import GROWTH_MOST, JUMP, Evidence, Sightings, n_around
+from slamcli.slam.standing_objects import GROWTH_MOST, JUMP, MovingSightings, PlaceEvidence, n_around
 
 AFTER = (0.07, 0.14, 0.2, 0.35, 0.55, 0.8, 1.1)  # [s] before and after a view, of the views that it is compared with
 LATER, MUCH_LATER = (1.5, 2.0, 2.6, 3.3), (4.0, 5.0, 6.5, 8.0, 10.0, 13.0, 16.0)  # the same, for what waits, and for what is taken away
@@ -79,7 +79,7 @@ def find(views: Views, progress: Callable[[range], Iterable[int]] = iter, *, rul
 
     What moves in one view is followed to the views before and after it, to where it stands.
     """
-    sightings = Sightings.none(len(views.stamp), shape(views.camera))
+    sightings = MovingSightings.none(len(views.stamp), shape(views.camera))
     for frame in progress(range(len(views.stamp))):
         evidence = weigh(views, frame, rule.after)
         if evidence is not None:
@@ -95,7 +95,7 @@ def find(views: Views, progress: Callable[[range], Iterable[int]] = iter, *, rul
     return moving
 
 
-def _find_in(evidence: Evidence, rule: Rule) -> tuple[np.ndarray, np.ndarray]:
+def _find_in(evidence: PlaceEvidence, rule: Rule) -> tuple[np.ndarray, np.ndarray]:
     """Find what surely moves in one view, (v, u) bool, by what other views say of it, and all that moves with it."""
     z, seed = evidence.depth, _surely_moving(evidence, rule)
     is_still = (evidence.n_still >= MIN_STILL) & (evidence.n_through == 0)
@@ -115,7 +115,7 @@ def _outline(moving: np.ndarray, z: np.ndarray) -> np.ndarray:
     return (z == 0) & (n_moving >= np.where(n_still > 0, OUTLINE, ENCLOSED))
 
 
-def weigh(views: Views, frame: int, after: tuple[float, ...]) -> Evidence | None:
+def weigh(views: Views, frame: int, after: tuple[float, ...]) -> PlaceEvidence | None:
     """Compare a view with those `after` [s] before and after it; None where none can be compared."""
     others = _others(views, frame, after) if views.depth.size else np.zeros(0, dtype=np.int64)
     if len(others) == 0 or not np.isfinite(views.T_wc[frame, 0, 0]):
@@ -123,7 +123,7 @@ def weigh(views: Views, frame: int, after: tuple[float, ...]) -> Evidence | None
     middle, seen = seen_from(views, frame, others)
     apart, is_again = views.stamp[others] - views.stamp[frame], seen == kernels.AGAIN
     when = np.where(is_again, apart.astype(np.float32)[:, None, None], np.float32(0.0))
-    return Evidence(
+    return PlaceEvidence(
         depth=middle,
         n_through=(seen == kernels.THROUGH).sum(axis=0),
         n_still=is_again[np.abs(apart) >= LONG].sum(axis=0),
@@ -145,7 +145,7 @@ def _others(views: Views, frame: int, after: tuple[float, ...]) -> np.ndarray:
     return others[usable]
 
 
-def _surely_moving(evidence: Evidence, rule: Rule) -> np.ndarray:
+def _surely_moving(evidence: PlaceEvidence, rule: Rule) -> np.ndarray:
     """Find the places that enough views look through, against those that find them again, in groups large enough."""
     seed = (evidence.n_through >= rule.min_through) & (evidence.n_through > rule.weight_still * evidence.n_still)
     return kernels.groups(seed, evidence.depth, GROUP_JUMP, rule.min_group)

@@ -25,7 +25,7 @@ FILL_ROUNDS = 3
 
 
 @dataclass(frozen=True)
-class Evidence:
+class PlaceEvidence:
     """What other views say of the places (v, u) of one view."""
 
     depth: np.ndarray  # (v, u) float32 [m], 0 = unknown
@@ -36,7 +36,7 @@ class Evidence:
 
 
 @dataclass(frozen=True)
-class Sightings:
+class MovingSightings:
     """The evidence of all views that following needs, and what it says, (F, v, u) each."""
 
     depth: np.ndarray  # float16 [m], 0 = unknown
@@ -47,12 +47,12 @@ class Sightings:
     is_unconfirmed: np.ndarray  # bool, a surface that no view some time apart finds again
 
     @classmethod
-    def none(cls, n: int, places: tuple[int, int]) -> "Sightings":
+    def none(cls, n: int, places: tuple[int, int]) -> "MovingSightings":
         """Begin with nothing seen in any of n views."""
         half, flag = ((n, *places), np.float16), ((n, *places), np.bool_)
         return cls(*(np.zeros(*kind) for kind in (half, half, half, flag, flag, flag)))
 
-    def note(self, frame: int, evidence: Evidence, is_sure: np.ndarray, is_moving: np.ndarray) -> None:
+    def note(self, frame: int, evidence: PlaceEvidence, is_sure: np.ndarray, is_moving: np.ndarray) -> None:
         """Keep what is known of a view."""
         self.depth[frame], self.since[frame], self.until[frame] = evidence.depth, evidence.since, evidence.until
         self.is_sure[frame], self.is_moving[frame] = is_sure, is_moving
@@ -63,7 +63,7 @@ class Sightings:
         return self.depth[frame].astype(np.float32)
 
 
-def follow(views: Views, sightings: Sightings, *, most: float) -> np.ndarray:
+def follow(views: Views, sightings: MovingSightings, *, most: float) -> np.ndarray:
     """Find what moves in every view, (F, v, u) bool, also while it stands; most : [s] that it may have stood there."""
     n = len(views.stamp)
     found = sightings.is_moving.copy()
@@ -79,7 +79,9 @@ def follow(views: Views, sightings: Sightings, *, most: float) -> np.ndarray:
     return found
 
 
-def _left_at(views: Views, sightings: Sightings, frames: tuple[int, int], left_before: np.ndarray, sign: float, most: float) -> np.ndarray:
+def _left_at(
+    views: Views, sightings: MovingSightings, frames: tuple[int, int], left_before: np.ndarray, sign: float, most: float
+) -> np.ndarray:
     """Find when (v, u) float64 [s] what moves in a view left the place that it is seen in, NaN where nothing moves.
 
     frames : the view that was looked at before, -1 = none, and this one; left_before : of the former

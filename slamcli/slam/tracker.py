@@ -7,7 +7,7 @@ from slamcli.geometry import se3
 from slamcli.geometry.algebra import product
 from slamcli.schema import KEY_FRAME, ON_DEPTH, TRACKED, Map, Tracks
 from slamcli.slam import background_prior, key_frames, rests
-from slamcli.slam.depth_tracking import Placement
+from slamcli.slam.depth_tracking import DepthPlacement
 from slamcli.slam.localizer import KnownMap, Localizer, Location, nothing_seen
 from slamcli.slam.map_growth import MapGrowth
 from slamcli.slam.place_recognition import PlaceIndex
@@ -84,7 +84,7 @@ class Tracker:
             return self._leaves_reference_by_depth(i, location.placement)
         return key_frames.wants_key_frame(self._sighting(i, frame, location.landmark), self._settings)
 
-    def _leaves_reference_by_depth(self, i: int, placement: Placement) -> bool:
+    def _leaves_reference_by_depth(self, i: int, placement: DepthPlacement) -> bool:
         if self._poses.anchored < i:
             return False  # what rests on it would share the error that the frames before it lent
         return key_frames.wants_key_frame_by_depth(self._poses.T_kc[i], placement.alignment.overlap, self._settings)

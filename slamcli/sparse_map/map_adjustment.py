@@ -41,7 +41,7 @@ def _sigma_of_octave(pixel_noise: float, octave_scale: float) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class Part:
+class MapPart:
     """A part of the map as bundle adjustment takes it."""
 
     kfs: np.ndarray  # (K,) key frames that take part, increasing
@@ -57,7 +57,7 @@ class Part:
         return Variables(sparse_map.T_kw(self.kfs), sparse_map.lm.xyz[self.ids])
 
 
-def gather(sparse_map: SparseMap, moving: np.ndarray, sensor: SensorConfig) -> Part:
+def gather(sparse_map: SparseMap, moving: np.ndarray, sensor: SensorConfig) -> MapPart:
     """Gather the key frames `moving` and all they see; key frames outside that see the same, or that edges join to them, are held fixed.
 
     In a segment where none is held so, the oldest of `moving` is, which fixes the gauge.
@@ -77,10 +77,10 @@ def gather(sparse_map: SparseMap, moving: np.ndarray, sensor: SensorConfig) -> P
     )
     measured = measure(sparse_map.features, row, sensor)
     seen = Observations(kf_index, obs_lm, measured.xy, measured.depth, measured.sigma_px, measured.sigma_z)
-    return Part(kfs, is_fixed, shared, ids[is_single], row, seen, edges)
+    return MapPart(kfs, is_fixed, shared, ids[is_single], row, seen, edges)
 
 
-def landmarks_alone(part: Part, first: int, end: int) -> Part:
+def landmarks_alone(part: MapPart, first: int, end: int) -> MapPart:
     """Return the landmarks that key frames `first` to `end`, the last left out, see more than once, without edges between key frames."""
     is_in = (part.kfs >= first) & (part.kfs < end)
     index, old_lm = np.cumsum(is_in) - 1, np.asarray(part.seen.lm)
@@ -91,7 +91,7 @@ def landmarks_alone(part: Part, first: int, end: int) -> Part:
     seen = Observations(index[part.seen.kf[is_used]].astype(np.int32), lm, *columns)
     kfs, is_fixed = part.kfs[is_in], part.is_fixed[is_in].copy()
     is_fixed[:1] = True
-    return Part(kfs, is_fixed, part.ids[ids], part.singles[:0], part.row[is_used], seen, NO_EDGES)
+    return MapPart(kfs, is_fixed, part.ids[ids], part.singles[:0], part.row[is_used], seen, NO_EDGES)
 
 
 def adjust(

@@ -86,7 +86,7 @@ AS_RECORDED = Colours({}, np.ones((1, 1, 3), np.float32))
 
 
 @dataclass(frozen=True)
-class View:
+class KeyFrameView:
     """What one key frame sees."""
 
     frame: int
@@ -115,12 +115,12 @@ def find_colours(depths: DepthFrames, poses: Iterable[PosedFrame], sensor: Senso
     return Colours(dict(zip(frame, found.gain, strict=True)), found.shading(depths.camera.height, depths.camera.width))
 
 
-def views(depths: DepthFrames, poses: Iterable[PosedFrame], sensor: SensorConfig, option: DensifyConfig) -> Iterator[View]:
+def views(depths: DepthFrames, poses: Iterable[PosedFrame], sensor: SensorConfig, option: DensifyConfig) -> Iterator[KeyFrameView]:
     """Read and clean frames, in order, without what moves; one without depth, or that cannot be read, gives no view."""
     is_volume = option.method == "tsdf"
     nearer = replace(sensor, depth_max=min(sensor.depth_max, option.depth_max))
 
-    def look(frame: int, depth: np.ndarray, T_wk: np.ndarray) -> View:
+    def look(frame: int, depth: np.ndarray, T_wk: np.ndarray) -> KeyFrameView:
         seen = oriented_points.surface(
             depth,
             depths.camera,
@@ -129,6 +129,6 @@ def views(depths: DepthFrames, poses: Iterable[PosedFrame], sensor: SensorConfig
             stride=1 if is_volume else option.stride,
             spacing=0.0 if is_volume else SAMPLES_APART * option.voxel,
         )
-        return View(frame, T_wk, depth, seen, depths.dataset.rgb(frame))
+        return KeyFrameView(frame, T_wk, depth, seen, depths.dataset.rgb(frame))
 
     return depths.look_at(poses, look)

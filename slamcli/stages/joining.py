@@ -56,7 +56,7 @@ ADDED = ("features", "pairs", "frames_without_depth", "bad_images", "tracked", "
 
 
 @dataclass(frozen=True)
-class Part:
+class RecordingPart:
     """What a stage made of one recording."""
 
     name: str
@@ -73,7 +73,7 @@ class Part:
         return artifacts.adopted(self.made.load(cls, stage))
 
 
-def join_extract(parts: Sequence[Part], inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
+def join_extract(parts: Sequence[RecordingPart], inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
     """Join the features of recordings, and their coarse depth."""
     dataset = inputs.dataset
     assert isinstance(dataset, JoinedDataset)
@@ -113,7 +113,7 @@ def join_extract(parts: Sequence[Part], inputs: Inputs, out: Path, cfg: Config, 
     }
 
 
-def join_match(parts: Sequence[Part], inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
+def join_match(parts: Sequence[RecordingPart], inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
     """Join the words of recordings and the matches within them; none are sought between them."""
     first = inputs.load(Recordings, "extract").recording_offset
     words = [part.load(Words, "match") for part in parts]
@@ -136,7 +136,7 @@ def join_match(parts: Sequence[Part], inputs: Inputs, out: Path, cfg: Config, to
     }
 
 
-def join_track(parts: Sequence[Part], inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
+def join_track(parts: Sequence[RecordingPart], inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
     """Put the maps of recordings side by side, each in a world of its own, and with them what moves."""
     features, offset = inputs.load(Features, "extract"), inputs.load(Recordings, "extract").recording_offset
     tracks, map_ = _joined_map(parts, "track", features, offset)
@@ -157,7 +157,7 @@ def join_track(parts: Sequence[Part], inputs: Inputs, out: Path, cfg: Config, to
     )
 
 
-def join_optimize(parts: Sequence[Part], inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
+def join_optimize(parts: Sequence[RecordingPart], inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
     """Put the adjusted maps of recordings side by side, with what their features measured once each one's own timing is taken out.
 
     Raises SlamError where calibrations were to be found: those of several recordings cannot be told in one camera's pixels beforehand.
@@ -180,11 +180,11 @@ def join_optimize(parts: Sequence[Part], inputs: Inputs, out: Path, cfg: Config,
     return _added(parts)
 
 
-Join = Callable[[Sequence[Part], Inputs, Path, Config, Tools], Summary]
+Join = Callable[[Sequence[RecordingPart], Inputs, Path, Config, Tools], Summary]
 JOINS: dict[str, Join] = {"extract": join_extract, "match": join_match, "track": join_track, "optimize": join_optimize}
 
 
-def _added(parts: Sequence[Part]) -> dict[str, Any]:
+def _added(parts: Sequence[RecordingPart]) -> dict[str, Any]:
     """Add up the counts of recordings, and collect the doubts about each."""
     names = [name for name in ADDED if any(name in part.summary for part in parts)]
     doubts = [
@@ -211,7 +211,7 @@ def _octaves(octave: np.ndarray, scale: float, how: Retelling) -> np.ndarray:
     return np.clip(octave + levels, 0, LARGEST_OCTAVE).astype(np.uint8)
 
 
-def _save_coarse(parts: Sequence[Part], how: Sequence[Retelling], common: Camera, out: Path) -> None:
+def _save_coarse(parts: Sequence[RecordingPart], how: Sequence[Retelling], common: Camera, out: Path) -> None:
     """Join the coarse depth images of recordings; code is taken as it is where the camera is the common one."""
     offsets = []
     with artifacts.Writer(CoarseDepth, out, "coarse_code") as writer:
@@ -223,7 +223,7 @@ def _save_coarse(parts: Sequence[Part], how: Sequence[Retelling], common: Camera
         writer.finish(coarse_shape=np.array(icp.coarse_shape(common), dtype=np.int32), coarse_offset=_offsets(offsets))
 
 
-def _retold(part: Part, how: Retelling) -> CoarseDepth:
+def _retold(part: RecordingPart, how: Retelling) -> CoarseDepth:
     """Return a recording's coarse depth images as the common camera's."""
     small = Retelling(icp.coarse_camera(how.own)[0], icp.coarse_camera(how.common)[0])
 
@@ -236,7 +236,7 @@ def _retold(part: Part, how: Retelling) -> CoarseDepth:
     return encode((tell(images[frame]) for frame in range(len(images))), icp.coarse_shape(how.common))
 
 
-def _joined_map(parts: Sequence[Part], stage: str, features: Features, offset: np.ndarray) -> tuple[Tracks, Map]:
+def _joined_map(parts: Sequence[RecordingPart], stage: str, features: Features, offset: np.ndarray) -> tuple[Tracks, Map]:
     """Join poses and maps; segments are numbered by the frames that belong to them."""
     maps = [part.made.load(Map, stage) for part in parts]
     tracks = [part.made.load(Tracks, stage) for part in parts]
@@ -269,7 +269,7 @@ def _joined_map(parts: Sequence[Part], stage: str, features: Features, offset: n
     return found, map_segments.ranked(joined, found)
 
 
-def _save_measured(parts: Sequence[Part], timings: Sequence[Timing], camera: Camera, out: Path) -> None:
+def _save_measured(parts: Sequence[RecordingPart], timings: Sequence[Timing], camera: Camera, out: Path) -> None:
     with artifacts.Writer(Measured, out, "measured_xy", "measured_depth") as writer:
         for part, timing in zip(parts, timings, strict=True):
             corrected = self_calibration.correct(part.load(Features, "extract"), part.camera, Sensing(part.camera, timing, {}))
@@ -279,7 +279,7 @@ def _save_measured(parts: Sequence[Part], timings: Sequence[Timing], camera: Cam
         writer.finish()
 
 
-def _moving(parts: Sequence[Part], camera: Camera) -> Moving:
+def _moving(parts: Sequence[RecordingPart], camera: Camera) -> Moving:
     """Join what moves, told in blocks of the common camera's picture; nothing where nothing moves in any recording."""
     found = [part.made.load(Moving, "track").moving for part in parts]
     if not any(len(one) for one in found):

@@ -28,7 +28,7 @@ FACES = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0
 
 
 @dataclass(frozen=True)
-class View:
+class Viewpoint:
     """Where from and how large; the scene is centred and fills the picture."""
 
     azimuth_deg: float = 235.0  # of the camera as seen from the scene, from x towards y
@@ -56,7 +56,7 @@ class Eye:
 
 
 def draw_cloud(
-    xyz: np.ndarray, rgb: np.ndarray, normal: np.ndarray | None, *, spacing: float, view: View | Eye, path: np.ndarray | None = None
+    xyz: np.ndarray, rgb: np.ndarray, normal: np.ndarray | None, *, spacing: float, view: Viewpoint | Eye, path: np.ndarray | None = None
 ) -> np.ndarray:
     """Draw points (N, 3) with colours (N, 3) uint8 at some spacing [m]; returns (H, W, 3) uint8.
 
@@ -73,7 +73,7 @@ def draw_cloud(
 
 
 def draw_octree(
-    tree: Octree, *, view: View, threshold: float = 0.0, path: np.ndarray | None = None, with_scale: bool = False
+    tree: Octree, *, view: Viewpoint, threshold: float = 0.0, path: np.ndarray | None = None, with_scale: bool = False
 ) -> np.ndarray:
     """Draw the occupied cells' faces on free space, coloured by height, with a scale of it if wanted; returns (H, W, 3) uint8."""
     cell, faces = _visible_faces(tree, threshold)
@@ -107,7 +107,7 @@ def octree_heights(tree: Octree) -> tuple[float, float]:
     return _height_range((cell[:, 2] - CENTRE + 0.5) * tree.resolution)
 
 
-def draw_mesh(xyz: np.ndarray, triangle: np.ndarray, rgb: np.ndarray, *, view: View, path: np.ndarray | None = None) -> np.ndarray:
+def draw_mesh(xyz: np.ndarray, triangle: np.ndarray, rgb: np.ndarray, *, view: Viewpoint, path: np.ndarray | None = None) -> np.ndarray:
     """Draw triangles (M, 3) of vertex rows, seen from their front (counter-clockwise) side; returns (H, W, 3) uint8."""
     eye = look_at(xyz, view)
     corner = xyz[triangle].astype(np.float64)
@@ -122,7 +122,7 @@ def draw_mesh(xyz: np.ndarray, triangle: np.ndarray, rgb: np.ndarray, *, view: V
     return _finish(image, z_buffer, eye, path)
 
 
-def look_at(xyz: np.ndarray, view: View) -> Eye:
+def look_at(xyz: np.ndarray, view: Viewpoint) -> Eye:
     """Place the camera so that all but a few stray points just fit into the picture."""
     if not len(xyz):
         raise SlamError("the map is empty: nothing to draw")

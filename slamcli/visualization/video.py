@@ -9,7 +9,7 @@ import numpy as np
 from slamcli import files
 from slamcli.errors import SlamError
 from slamcli.geometry import se3
-from slamcli.visualization.render import OVERSAMPLING, Eye, View, look_at
+from slamcli.visualization.render import OVERSAMPLING, Eye, Viewpoint, look_at
 
 FRAMES_PER_SECOND = 30
 BEHIND = 0.35  # [m] behind the camera that was: some of what it stood beside comes into view
@@ -17,10 +17,10 @@ SMOOTHED = 1.0  # [s] of the film over which the camera's way is averaged
 CODEC = "libx264"
 
 
-def round_the_scene(xyz: np.ndarray, view: View, n: int) -> Iterator[Eye]:
+def round_the_scene(xyz: np.ndarray, view: Viewpoint, n: int) -> Iterator[Eye]:
     """Yield the eyes of one turn about a cloud (N, 3), all equally far from its middle, from the view's direction on."""
     turn = np.linspace(0.0, 360.0, n, endpoint=False)
-    views = [View(view.azimuth_deg + a, view.elevation_deg, view.width, view.height, view.field_of_view_deg) for a in turn]
+    views = [Viewpoint(view.azimuth_deg + a, view.elevation_deg, view.width, view.height, view.field_of_view_deg) for a in turn]
     middle = 0.5 * np.quantile(xyz, [0.002, 0.998], axis=0).sum(axis=0)
     sample = [look_at(xyz, one) for one in views[:: max(1, n // 24)]]
     distance = max(float(np.linalg.norm(eye.centre_l - middle)) for eye in sample)
@@ -29,7 +29,7 @@ def round_the_scene(xyz: np.ndarray, view: View, n: int) -> Iterator[Eye]:
         yield Eye(eye.R_cl, middle - distance * eye.R_cl[2], eye.focal, eye.width, eye.height)
 
 
-def along_the_way(T_lc: np.ndarray, view: View, n: int) -> Iterator[Eye]:
+def along_the_way(T_lc: np.ndarray, view: Viewpoint, n: int) -> Iterator[Eye]:
     """Yield eyes that follow the camera's poses (F, 4, 4), smoothed, from a little behind it; rows of NaN are left out."""
     T_lc = T_lc[np.isfinite(T_lc[:, 0, 0])]
     if len(T_lc) == 0:

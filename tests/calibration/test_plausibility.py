@@ -9,7 +9,7 @@ from scene_run import Run
 from scenes import CAMERA, Scene, observe, orbit, room_points
 
 from slamcli.calibration import plausibility, rolling_shutter, self_calibration
-from slamcli.calibration.plausibility import Deviation, Rigidity, Seen
+from slamcli.calibration.plausibility import Deviation, Rigidity, SeenTwice
 from slamcli.calibration.self_calibration import Sensing
 from slamcli.config.options import SensorConfig
 from slamcli.geometry import se3
@@ -99,9 +99,9 @@ def test_points_seen_twice_are_rigid_under_the_right_focal_length_alone(factor: 
         both = []
         for x in (points, se3.transform(T, points)):
             depth = x[:, 2] + rng.normal(0.0, 0.01, len(x))
-            both.append(Seen(CAMERA.project(x) + rng.normal(0.0, 0.5, (len(x), 2)), depth))
+            both.append(SeenTwice(CAMERA.project(x) + rng.normal(0.0, 0.5, (len(x), 2)), depth))
         order = np.concatenate([rng.permutation(30), np.arange(30, 150)])
-        views.append((both[0], Seen(both[1].xy[order], both[1].depth[order])))
+        views.append((both[0], SeenTwice(both[1].xy[order], both[1].depth[order])))
     believed = replace(CAMERA, fx=CAMERA.fx / factor, fy=CAMERA.fy / factor)
     found = plausibility.most_rigid(views, believed, SensorConfig())
     assert found is not None and found.pairs == 6
@@ -110,7 +110,7 @@ def test_points_seen_twice_are_rigid_under_the_right_focal_length_alone(factor: 
 
 
 def test_too_few_points_say_nothing() -> None:
-    few = Seen(np.zeros((5, 2)), np.ones(5))
+    few = SeenTwice(np.zeros((5, 2)), np.ones(5))
     assert plausibility.most_rigid([(few, few)], CAMERA, SensorConfig()) is None
     assert plausibility.most_rigid([], CAMERA, SensorConfig()) is None
 

@@ -144,7 +144,7 @@ def test_a_run_with_an_empty_map_can_be_exported_but_not_drawn(tmp_path: Path) -
     empty = prune(OccupancyMap(0.05, hit=0.7, miss=0.4, clamp_min=0.1, clamp_max=0.9).leaves())
     octomap.write_bt(tmp_path / "map.bt", empty)
     with pytest.raises(SlamError, match="nothing to draw"):
-        render.draw_octree(octomap.read(tmp_path / "map.bt"), view=render.View())
+        render.draw_octree(octomap.read(tmp_path / "map.bt"), view=render.Viewpoint())
 
 
 def test_a_floor_plan_is_written_and_told(slamcli: Callable, known: RunDir, tmp_path: Path) -> None:

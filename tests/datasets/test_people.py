@@ -12,7 +12,7 @@ from slamcli.datasets.simulate import DEPTH_SCALE, simulate
 from slamcli.datasets.simulated import people
 from slamcli.datasets.simulated.drive import Motion, look_along
 from slamcli.datasets.simulated.figure_raycast import Crowd
-from slamcli.datasets.simulated.figures import BOX, ELLIPSOID, Figure, Part
+from slamcli.datasets.simulated.figures import BOX, ELLIPSOID, BodyPart, Figure
 from slamcli.datasets.simulated.texture import flat
 from slamcli.errors import SlamError
 from slamcli.geometry.camera import Camera
@@ -65,7 +65,7 @@ def test_a_part_lies_where_geometry_says(kind: int, near: float) -> None:
     """A part of half axes 0.3, 0.2, 0.4 m, two metres ahead along its own x axis."""
     pose = np.eye(4)
     pose[:3, 3] = [2.0, 0.0, 1.0]
-    part = Part("part", kind, np.array([near, 0.2, 0.4]), flat((200, 100, 50)))
+    part = BodyPart("part", kind, np.array([near, 0.2, 0.4]), flat((200, 100, 50)))
     figure = Figure("it", "box", [part], lambda stamp: np.tile(pose, (len(stamp), 1, 1, 1)))
     crowd = Crowd([figure], CAMERA, texel=0.01, seed=0)
     T_lc = look_along(np.array([[0.0, 0.0, 1.0]]), np.array([0.0]), 0.0, 0.0)[0]

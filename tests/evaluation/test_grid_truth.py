@@ -8,7 +8,7 @@ from boxroom import FURNITURE, HANGING, KINECT, LOW, ROOM, look_along, render, r
 
 from slamcli.errors import SlamError
 from slamcli.evaluation import grid_truth
-from slamcli.evaluation.grid_truth import Scene
+from slamcli.evaluation.grid_truth import TrueRoom
 from slamcli.geometry import se3
 from slamcli.schema import Grid
 
@@ -27,7 +27,7 @@ def scene():
         }
         for name, box in zip(NAMES, FURNITURE, strict=True)
     ]
-    return Scene(*(np.array(corner) for corner in ROOM), solids)
+    return TrueRoom(*(np.array(corner) for corner in ROOM), solids)
 
 
 def perfect(T_sl, points, *, resolution=0.05):
@@ -60,7 +60,7 @@ def test_rays_meet_a_turned_box_and_a_cylinder():
         {"name": "a", "type": "box", "centre": [2.0, 0.0, 0.5], "size": [1.0, 1.0, 1.0], "yaw": np.pi / 4},
         {"name": "b", "type": "cylinder", "centre": [0.0, 3.0, 0.5], "radius": 0.5, "height": 1.0},
     ]
-    room = Scene(np.array([-5.0, -5.0, 0.0]), np.array([5.0, 5.0, 3.0]), solids)
+    room = TrueRoom(np.array([-5.0, -5.0, 0.0]), np.array([5.0, 5.0, 3.0]), solids)
     rays = np.array([[1.0, 0, 0], [0, 1.0, 0], [0, -1.0, 0], [0, 0, -1.0], [0, 0.5, 0.1], [-1e-9, 1.0, 0.5]])
     expected = [2.0 - np.sqrt(0.5), 2.5, 5.0, 0.5, 5.0, 5.0]
     np.testing.assert_allclose(grid_truth.cast(room, np.array([0.0, 0.0, 0.5]), rays), expected, atol=1e-6)

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from slamcli.config.options import GridConfig, SensorConfig
 from slamcli.depth import icp
 from slamcli.evaluation import map_evidence, map_verdict
-from slamcli.evaluation.map_evidence import View
+from slamcli.evaluation.map_evidence import FrameSurface
 from slamcli.evaluation.map_verdict import DOUBLED, HOLES, NO_FLOOR, SMALL, TOO_HIGH, WALL, Verdict
 from slamcli.navigation.grid import build_grid
 from slamcli.runs.run_directory import RunDir
@@ -37,7 +37,7 @@ def recorded(T_lc, *, boxes=FURNITURE, far=4.0, holes=0.0, seed=0):
 
 def views_of(images, T_lc):
     coarse = [icp.coarsen(depth) for depth in images]
-    return [View(T, icp.surface_points(c, KINECT, SENSOR), float((c == 0).mean())) for c, T in zip(coarse, T_lc, strict=True)]
+    return [FrameSurface(T, icp.surface_points(c, KINECT, SENSOR), float((c == 0).mean())) for c, T in zip(coarse, T_lc, strict=True)]
 
 
 def judged(T_lc, images, *, is_floor_found=True, placed=None) -> Verdict:

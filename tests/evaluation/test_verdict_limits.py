@@ -5,10 +5,10 @@ from dataclasses import replace
 import pytest
 
 from slamcli.evaluation import map_verdict
-from slamcli.evaluation.map_evidence import Evidence
+from slamcli.evaluation.map_evidence import MapEvidence
 from slamcli.evaluation.map_verdict import DOUBLED, HOLES, NO_FLOOR, OFF_PATH, RARE_FLOOR, SMALL, TOO_HIGH, WALL
 
-SOUND = Evidence(
+SOUND = MapEvidence(
     free_area=20.0, path_area=6.0, path_known=0.9, is_floor_found=True, views=100, views_with_floor=90, views_of_a_wall=0, missing=0.1,
     views_doubled=0, doubled_by=float("nan"), camera_height=1.0, camera_pitch_deg=20.0,
 )  # fmt: skip

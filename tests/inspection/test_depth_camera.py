@@ -13,7 +13,7 @@ from slamcli.config.options import RecordingConfig
 from slamcli.datasets import open_dataset, silent
 from slamcli.datasets.simulate import simulate
 from slamcli.errors import SlamError
-from slamcli.estimation.shared_parameters import Evidence
+from slamcli.estimation.shared_parameters import SharedEvidence
 from slamcli.geometry import se3
 from slamcli.geometry.camera import Camera
 from slamcli.geometry.depth_registration import Registration
@@ -97,10 +97,10 @@ def test_a_principal_point_aside_costs_no_focal_length(sound: Path, tmp_path: Pa
 
 def test_a_map_is_heard_that_the_edges_do_not_contradict() -> None:
     edges = depth_camera.DepthCamera(np.zeros(9), np.diag(np.full(9, 4.0)), 4.0, 1.0, 500.0)
-    near = edges.told_by(Evidence(np.diag(np.full(9, 12.0)), np.full(9, 6.0)))
+    near = edges.told_by(SharedEvidence(np.diag(np.full(9, 12.0)), np.full(9, 6.0)))
     np.testing.assert_allclose(near.numbers, 1.5 / 7.0)
     np.testing.assert_allclose(near.sigma, 1.0 / np.sqrt(7.0))
-    assert edges.told_by(Evidence(np.diag(np.full(9, 12.0)), np.full(9, 36.0))) is edges
+    assert edges.told_by(SharedEvidence(np.diag(np.full(9, 12.0)), np.full(9, 36.0))) is edges
 
 
 @pytest.mark.shows("recording.find_depth_camera")

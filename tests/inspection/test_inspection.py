@@ -71,7 +71,7 @@ def test_variant_of_a_fault_is_found(spoilt: Path, fault: Callable[[Path], None]
 )
 def test_fault_is_found_without_the_help_of_file_names(spoilt: Path, fault: Callable[[Path], None]) -> None:
     fault(spoilt)
-    faults.anonymise(spoilt)
+    faults.anonymize(spoilt)
     assert alarms(inspect(str(spoilt))) & (faults.FAULTS | faults.VARIANTS)[fault]
 
 

@@ -9,7 +9,7 @@ from test_walls import NOISE
 
 from slamcli.datasets.simulate import Simulation, build
 from slamcli.datasets.simulated import building
-from slamcli.evaluation.grid_truth import Scene, footprint
+from slamcli.evaluation.grid_truth import TrueRoom, footprint
 from slamcli.geometry import se3
 from slamcli.navigation.floor_plan import FloorPlan, make_floor_plan
 from slamcli.navigation.reach import reach
@@ -27,7 +27,7 @@ def seen(seed: int, turn: float) -> tuple[Grid, np.ndarray, np.ndarray, np.ndarr
     """Grid and cloud (xyz, normal) of a building as somebody who was everywhere would have them, and T_gb (3, 3) into their frame."""
     about = build(Simulation(building=True, rooms=N_ROOMS, laps=1.0, frames=2, seed=seed))[0].to_dict()
     low, high = (np.array(about["room"][end], float) for end in ("min", "max"))
-    scene = Scene(low, high, about["obstacles"])
+    scene = TrueRoom(low, high, about["obstacles"])
     T_gb = se3.exp(np.array([0.3173, -0.221, 0.0, 0.0, 0.0, turn]))
     R = T_gb[:2, :2]
     corners = np.array([[x, y] for x in (low[0], high[0]) for y in (low[1], high[1])]) @ R.T + T_gb[:2, 3]
@@ -48,7 +48,7 @@ def seen(seed: int, turn: float) -> tuple[Grid, np.ndarray, np.ndarray, np.ndarr
     return grid, se3.transform(T_gb, xyz), normal @ T_gb[:3, :3].T, T_gb
 
 
-def points_of(scene: Scene, solid: dict, *, inwards: bool = False) -> tuple[np.ndarray, np.ndarray]:
+def points_of(scene: TrueRoom, solid: dict, *, inwards: bool = False) -> tuple[np.ndarray, np.ndarray]:
     """Points and normals of the upright faces of a box, where nothing stands right before them."""
     centre, half = np.array(solid["centre"]), 0.5 * np.array(solid["size"])
     c, s = np.cos(solid["yaw"]), np.sin(solid["yaw"])

@@ -5,10 +5,10 @@ from slamcli.errors import SlamError
 from slamcli.geometry import voxel
 from slamcli.geometry.octree import CENTRE, DEPTH, Octree
 from slamcli.visualization import render
-from slamcli.visualization.render import BACKGROUND, View
+from slamcli.visualization.render import BACKGROUND, Viewpoint
 
 RED, GREEN, BLUE = (200, 0, 0), (0, 200, 0), (0, 0, 200)
-FRONT = View(azimuth_deg=-90.0, elevation_deg=0.0, width=160, height=120)  # from -y: x to the right, z up
+FRONT = Viewpoint(azimuth_deg=-90.0, elevation_deg=0.0, width=160, height=120)  # from -y: x to the right, z up
 
 
 def colours(image: np.ndarray) -> set[tuple[int, ...]]:
@@ -21,7 +21,7 @@ def wall(y: float, colour: tuple, facing: float, size: float = 1.0) -> tuple[np.
     return xyz, np.tile(np.uint8(colour), (len(x), 1)), np.tile([0.0, facing, 0.0], (len(x), 1))
 
 
-def drawn(*walls: tuple, view: View = FRONT) -> np.ndarray:
+def drawn(*walls: tuple, view: Viewpoint = FRONT) -> np.ndarray:
     xyz, rgb, normal = (np.concatenate(column) for column in zip(*walls, strict=True))
     return render.draw_cloud(xyz, rgb, normal, spacing=0.02, view=view)
 
@@ -68,7 +68,7 @@ def test_occupied_cells_are_drawn_where_they_bound_on_free_space() -> None:
     assert np.diff(drawn_rows).max() > 20  # two boxes and a gap
     columns = np.flatnonzero((image[drawn_rows[3]] != BACKGROUND).any(axis=1))
     assert np.ptp(columns) == pytest.approx(len(drawn_rows) / 2, abs=3)  # faces are square
-    behind = View(azimuth_deg=90.0, elevation_deg=0.0, width=160, height=120)
+    behind = Viewpoint(azimuth_deg=90.0, elevation_deg=0.0, width=160, height=120)
     assert colours(render.draw_octree(tree, view=behind)) == {BACKGROUND}
 
 

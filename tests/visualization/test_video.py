@@ -8,9 +8,9 @@ import pytest
 from slamcli.errors import SlamError
 from slamcli.geometry import se3
 from slamcli.visualization import video
-from slamcli.visualization.render import View
+from slamcli.visualization.render import Viewpoint
 
-VIEW = View(width=64, height=48)
+VIEW = Viewpoint(width=64, height=48)
 
 
 def test_a_turn_goes_round_the_middle_at_one_distance() -> None:

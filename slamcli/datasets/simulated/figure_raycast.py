@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from numba import f4, f8, i4, i8, u1
 
-from slamcli.datasets.simulated.figures import BOX, Figure, Part
+from slamcli.datasets.simulated.figures import BOX, BodyPart, Figure
 from slamcli.geometry import se3
 from slamcli.geometry.camera import Camera
 from slamcli.jit.kernel import kernel
@@ -98,7 +98,7 @@ class Crowd:
         return Drawn(*drawn)
 
 
-def _paint(part: Part, rng: np.random.Generator, texel: float) -> np.ndarray:
+def _paint(part: BodyPart, rng: np.random.Generator, texel: float) -> np.ndarray:
     """Paint the picture that is wrapped around an ellipsoid, or that every side of a box shows."""
     if part.kind == BOX:
         width, height = 2 * max(part.half[0], part.half[1]), 2 * part.half[2]

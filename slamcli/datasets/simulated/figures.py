@@ -24,7 +24,7 @@ CARRIED = np.array([0.2, 0.27, 0.17])  # [m] half the sides of the box that is c
 
 
 @dataclass(frozen=True)
-class Part:
+class BodyPart:
     """One rigid part of a figure."""
 
     name: str
@@ -51,11 +51,11 @@ class Figure:
 
     name: str
     kind: str  # "person" or "box"
-    parts: list[Part]
+    parts: list[BodyPart]
     pose: Callable[[np.ndarray], np.ndarray]  # stamps (N,) -> T_lp (N, parts, 4, 4), part to level frame
 
 
-def dress(rng: np.random.Generator) -> list[Part]:
+def dress(rng: np.random.Generator) -> list[BodyPart]:
     """Draw a person's clothes; the parts are in the order of `limbs`, the last of which not everybody wears."""
     palette = pick(rng, PALETTES)
     shirt = pick(rng, (p.shapes, p.mosaic, t.stripes((palette[0], palette[2], palette[4]), 0.09), t.fabric(palette[3], palette[1])))
@@ -63,8 +63,8 @@ def dress(rng: np.random.Generator) -> list[Part]:
     skin, hair = t.plaster(pick(rng, SKIN)), t.wood(pick(rng, HAIR), 20.0)
     shoe = t.fabric((40, 40, 44), palette[2])
 
-    def part(name: str, half: tuple[float, float, float], painter: Painter) -> Part:
-        return Part(name, ELLIPSOID, np.array(half), painter)
+    def part(name: str, half: tuple[float, float, float], painter: Painter) -> BodyPart:
+        return BodyPart(name, ELLIPSOID, np.array(half), painter)
 
     both = [
         [part(f"{side}_thigh", (0.085, 0.085, 0.25), trousers), part(f"{side}_shin", (0.06, 0.06, 0.24), trousers),

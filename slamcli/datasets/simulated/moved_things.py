@@ -7,7 +7,7 @@ import numpy as np
 from slamcli.datasets.simulated import furniture, picture
 from slamcli.datasets.simulated.brush import pick
 from slamcli.datasets.simulated.drive import Motion
-from slamcli.datasets.simulated.figures import BOX, Figure, Part, standing_at
+from slamcli.datasets.simulated.figures import BOX, BodyPart, Figure, standing_at
 from slamcli.datasets.simulated.scene import Doorway, Solid, box
 from slamcli.geometry.algebra import product
 
@@ -53,7 +53,7 @@ def door(doorway: Doorway, motion: Motion, rng: np.random.Generator) -> Moved:
         middle = np.column_stack([centre(angle), np.full(len(stamp), FLOOR_GAP + 0.5 * size[2])])
         return _upright(middle, angle)[:, None]
 
-    leaf = Part("leaf", BOX, 0.5 * size, picture.door(pick(rng, furniture.WOODS)))
+    leaf = BodyPart("leaf", BOX, 0.5 * size, picture.door(pick(rng, furniture.WOODS)))
     last = float(yaw(motion.colour_stamp[-1:])[0])
     place = [*centre(np.array(last)), FLOOR_GAP]
     return Moved(Figure("door", "door", [leaf], pose), [box("door", place, size, {"": leaf.painter}, yaw=last)])
@@ -76,7 +76,7 @@ def chair(places: tuple[list[Solid], ...], motion: Motion) -> Moved:
     def pose(stamp: np.ndarray) -> np.ndarray:
         return np.where((stamp < moves)[:, None, None, None], placed[0], placed[1])
 
-    parts = [Part(solid.name, BOX, 0.5 * solid.size, solid.painters[""]) for solid in places[first]]
+    parts = [BodyPart(solid.name, BOX, 0.5 * solid.size, solid.painters[""]) for solid in places[first]]
     return Moved(Figure("chair", "chair", parts, pose), [replace(solid, name=f"moved_{solid.name}") for solid in places[then]])
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from slamcli.datasets.simulated import picture
 from slamcli.datasets.simulated.drive import Motion
-from slamcli.datasets.simulated.figures import BOX, CARRIED, STRIDE, Figure, Part, Posture, dress, limbs, standing_at
+from slamcli.datasets.simulated.figures import BOX, CARRIED, STRIDE, BodyPart, Figure, Posture, dress, limbs, standing_at
 
 RATE = 60.0  # [Hz] at which walks are planned
 BRISK = 1.8  # [m/s] at most
@@ -74,10 +74,10 @@ def _person(name: str, activity: str, course: Course, rng: np.random.Generator) 
     def with_limbs(stamp: np.ndarray) -> np.ndarray:
         return limbs(posture(stamp), size)[:, : len(parts)]
 
-    scaled = [Part(part.name, part.kind, size * part.half, part.painter) for part in parts]
+    scaled = [BodyPart(part.name, part.kind, size * part.half, part.painter) for part in parts]
     found = [Figure(name, "person", scaled, with_limbs)]
     if box.any():
-        found.append(Figure(f"{name}/box", "box", [Part("box", BOX, CARRIED, picture.cardboard)], _carried(posture, course.t)))
+        found.append(Figure(f"{name}/box", "box", [BodyPart("box", BOX, CARRIED, picture.cardboard)], _carried(posture, course.t)))
     return found
 
 
