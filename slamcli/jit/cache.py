@@ -7,12 +7,14 @@ import atexit
 import functools
 import hashlib
 import os
+import pickle
 import shutil
 import tempfile
 from pathlib import Path
 from typing import Any
 
-from numba.core.caching import CompileResultCacheImpl, FunctionCache, _CacheLocator
+from numba import types
+from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataCacheFile, _CacheLocator
 
 from slamcli.user_cache import user_cache
 
@@ -84,10 +86,38 @@ class _KernelCacheImpl(CompileResultCacheImpl):
     _locator_classes = [KernelLocator]  # noqa: RUF012  # numba's own declaration
 
 
+class _Kept(IndexDataCacheFile):
+    """The files of one kernel. What cannot be read, as it names a record that is called otherwise now or is torn, counts as not there."""
+
+    _UNREADABLE = (AttributeError, ImportError, EOFError, ValueError, pickle.UnpicklingError)
+
+    def load(self, key: Any) -> Any:
+        """Read machine code; None where there is none."""
+        try:
+            return super().load(key)
+        except self._UNREADABLE:
+            return None
+
+    def _load_index(self) -> dict:
+        try:
+            return super()._load_index()
+        except self._UNREADABLE:
+            return {}
+
+
 class KernelCache(FunctionCache):
-    """The machine code of one kernel, by the types of its arguments."""
+    """The machine code of one kernel, by the types of its arguments and, of records, the names of their fields."""
 
     _impl_class = _KernelCacheImpl
+
+    def __init__(self, py_func: Any) -> None:
+        super().__init__(py_func)
+        self._cache_file = _Kept(self._cache_path, self._impl.filename_base, self._impl.locator.get_source_stamp())
+
+    def _index_key(self, sig: Any, codegen: Any) -> tuple:
+        """Tell records apart whose fields changed places: they come from any file, and to numba they are their types in order."""
+        fields = tuple(of.fields for of in getattr(sig, "args", sig) if isinstance(of, types.BaseNamedTuple))
+        return (*super()._index_key(sig, codegen), fields)
 
     def save_overload(self, sig: Any, data: Any) -> None:
         """Save machine code. A folder that is full or not to be written to costs time in the next process, and nothing now."""

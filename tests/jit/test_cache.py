@@ -37,6 +37,33 @@ print(sum(twice.stats.cache_hits.values()), sum(twice.stats.cache_misses.values(
 '''
 
 
+CALLER = """
+from records import Record
+
+from slamcli.jit.kernel import kernel
+
+
+@kernel
+def difference(pair):
+    return pair.first - pair.second
+
+
+print(difference(Record(first=5.0, second=2.0)))
+"""
+
+
+def difference(folder: Path, name: str, *fields: str) -> float:
+    """Call a kernel, in a process of its own, whose argument is a record of another file."""
+    lines = [f"class {name}(NamedTuple):", *(f"    {field}: float" for field in fields)]
+    (folder / "records.py").write_text("from typing import NamedTuple\n\n" + "\n".join(lines) + f"\n\n\nRecord = {name}\n")
+    (folder / "caller.py").write_text(CALLER)
+    environment = {**os.environ, "PYTHONPATH": str(PACKAGE.parent), "NUMBA_CACHE_DIR": str(folder / "kept"), "PYTHONDONTWRITEBYTECODE": "1"}
+    done = subprocess.run(
+        [sys.executable, "caller.py"], cwd=folder, env=environment, capture_output=True, text=True, check=True, timeout=120
+    )
+    return float(done.stdout)
+
+
 def run_helper(folder: Path, **environment: str) -> tuple[Path, int, int]:
     """Run the helper in a process of its own; gives the cache's folder, hits and misses."""
     (folder / "helper.py").write_text(HELPER)
@@ -65,6 +92,19 @@ def test_another_source_makes_machine_code_stale(tmp_path: Path, monkeypatch: py
     changed = HELPER.replace("return 2 * x", "return x * 2")
     monkeypatch.setitem(globals(), "HELPER", changed)
     assert run_helper(tmp_path, XDG_CACHE_HOME=home)[1:] == (0, 1)
+
+
+def test_a_record_of_another_file_whose_fields_change_places_makes_machine_code_stale(tmp_path: Path) -> None:
+    assert difference(tmp_path, "Pair", "first", "second") == 3.0
+    assert difference(tmp_path, "Pair", "second", "first") == 3.0
+
+
+def test_what_was_kept_for_a_record_that_is_no_more_is_not_there(tmp_path: Path) -> None:
+    assert difference(tmp_path, "Pair", "first", "second") == 3.0
+    assert difference(tmp_path, "Both", "first", "second") == 3.0
+    for kept in (tmp_path / "kept").rglob("*.nb[ic]"):
+        kept.write_bytes(kept.read_bytes()[:-7])
+    assert difference(tmp_path, "Both", "first", "second") == 3.0
 
 
 def test_the_user_may_name_the_folder_as_for_any_numba_program(tmp_path: Path) -> None:
