@@ -8,7 +8,7 @@ from slamcli.config.options import SensorConfig
 from slamcli.geometry import se3
 from slamcli.geometry.camera import Camera
 from slamcli.schema import Features, Matches, Words
-from slamcli.slam.recording import Recording
+from slamcli.slam.recording import TrackingInput
 from slamcli.sparse_map.frame import FrameStore
 
 CAMERA = Camera(640, 480, 520.0, 520.0, 320.0, 240.0)
@@ -30,8 +30,8 @@ class Scene:
     def frames(self, sensor: SensorConfig) -> FrameStore:
         return FrameStore(self.features, CAMERA, sensor)
 
-    def recording(self, sensor: SensorConfig) -> Recording:
-        return Recording(self.frames(sensor), self.words, self.matches)
+    def recording(self, sensor: SensorConfig) -> TrackingInput:
+        return TrackingInput(self.frames(sensor), self.words, self.matches)
 
 
 def look_at(position: np.ndarray, target: np.ndarray) -> np.ndarray:

@@ -208,6 +208,18 @@ def test_a_file_is_short_enough_for_one_subject(path: Path) -> None:
     assert len(path.read_text(encoding="utf-8").splitlines()) <= MOST_LINES
 
 
+BOTH_SIDES = {"Inputs", "Tools"}  # what a stage is promised, and what keeps the promise
+
+
+def test_the_name_of_a_class_has_one_meaning() -> None:
+    homes: dict[str, list[str]] = {}
+    for path in MODULES:
+        for node in ast.walk(parsed(path)):
+            if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+                homes.setdefault(node.name, []).append(name_of(path))
+    assert {name: where for name, where in homes.items() if len(where) > 1}.keys() == BOTH_SIDES
+
+
 # What belongs together travels together: as a record, whose fields say what each thing is.
 MOST_PARAMETERS = 8
 CHOSEN_BY_NAME = ("api.py: run",)  # its keywords are the options of `slamcli run`, each with a default

@@ -18,7 +18,7 @@ import numpy as np
 from slamcli.config.options import SensorConfig, SurfaceConfig
 from slamcli.depth import icp_kernels as kernels
 from slamcli.depth import noise_model, oriented_points
-from slamcli.depth.icp_kernels import AgreementRule, NormalEquations, PointImage, Points
+from slamcli.depth.icp_kernels import AgreementRule, PointImage, Points, PoseEquations
 from slamcli.geometry import depth_noise, se3
 from slamcli.geometry.algebra import eigh, product
 from slamcli.geometry.camera import Camera
@@ -163,8 +163,8 @@ def align(T_ij: np.ndarray, source: OrientedPoints, target: OrientedPoints, *, p
     if prior is not None:
         H_prior = H_prior + prior.information
         b_prior = product(prior.information, se3.log(product(prior.T, se3.inverse(T))))
-    found = NormalEquations(np.zeros((6, 6)), np.zeros(6))
-    met, agree, cost = kernels.align(T, source.points, target.points, target.view, SCHEDULE, RULE, NormalEquations(H_prior, b_prior), found)
+    found = PoseEquations(np.zeros((6, 6)), np.zeros(6))
+    met, agree, cost = kernels.align(T, source.points, target.points, target.view, SCHEDULE, RULE, PoseEquations(H_prior, b_prior), found)
     factor = READINGS_AS_ONE * max(cost / max(agree, 1), kernels.LEAST_VARIANCE_FACTOR)
     return Alignment(
         T_ij=se3.orthonormalize(T),

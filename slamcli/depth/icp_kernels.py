@@ -37,7 +37,7 @@ class AgreementRule(NamedTuple):
     readings_as_one: float  # what H and b are divided by, beside the variance factor
 
 
-class NormalEquations(NamedTuple):
+class PoseEquations(NamedTuple):
     """H xi = b of the left twist of T_ij."""
 
     H: f8[:, ::1]  # (6, 6)
@@ -175,8 +175,8 @@ def align(
     view: PointImage,
     schedule: f8[:, ::1],
     rule: AgreementRule,
-    known: NormalEquations,
-    out: NormalEquations,
+    known: PoseEquations,
+    out: PoseEquations,
 ):
     """Move T_ij (4, 4), in place, to where the points of j, the source, agree best with those of i; write H (upper triangle) and b there.
 

@@ -54,7 +54,7 @@ class NormalEquations(NamedTuple):
             block.fill(0.0)
 
 
-class ReducedSystem(NamedTuple):
+class ReducedBlocks(NamedTuple):
     """The reduced camera system S dx_c = rhs, and what eliminating the landmarks leaves."""
 
     block_of: i4[:, ::1]  # (n, n) number of each block of S
@@ -185,7 +185,7 @@ def _add_to_key_frame(u, g, x_c, M, q):
 
 
 @kernel(error_model="numpy")
-def eliminate(normal: NormalEquations, seen: Sightings, damping: f8, hold: f8[::1], reduced: ReducedSystem):
+def eliminate(normal: NormalEquations, seen: Sightings, damping: f8, hold: f8[::1], reduced: ReducedBlocks):
     """Assemble the reduced camera system S dx_c = rhs, the Schur complement of the landmarks.
 
     damping multiplies the diagonals (Marquardt); hold (n,) is added to the key frames' diagonals. S is to hold 0 before.

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from slamcli.estimation import bundle_kernels as kernels
-from slamcli.estimation.bundle_kernels import NormalEquations, ReducedSystem, SharedGradient, Sightings, Variables
+from slamcli.estimation.bundle_kernels import NormalEquations, ReducedBlocks, SharedGradient, Sightings, Variables
 from slamcli.estimation.reduced_camera_system import order_and_blocks
 from slamcli.estimation.relative_pose_factors import NO_EDGES, Edges, EdgeTerms
 from slamcli.estimation.robust_loss import CHI2_95_2DOF, CHI2_95_3DOF, HUBER, Huber
@@ -148,7 +148,7 @@ class Problem:
         damping : factor on their diagonal (Marquardt); hold : (n,) added to the key frames'
         """
         self.system.blocks.fill(0.0)
-        reduced = ReducedSystem(self.system.block_of, self.system.blocks, self.rhs, self.V_inv, self._scratch)
+        reduced = ReducedBlocks(self.system.block_of, self.system.blocks, self.rhs, self.V_inv, self._scratch)
         kernels.eliminate(self.normal, self._seen, damping, hold, reduced)
         self._edge_terms.add_to(self.system.blocks)
 

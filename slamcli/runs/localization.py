@@ -19,7 +19,7 @@ from slamcli.slam import frame_refinement
 from slamcli.slam.depth_tracking import FramePoints
 from slamcli.slam.localizer import KnownMap, Localizer
 from slamcli.slam.place_recognition import PlaceIndex
-from slamcli.slam.recording import Recording, TrackedRecording
+from slamcli.slam.recording import TrackedRecording, TrackingInput
 from slamcli.sparse_map.frame import FrameStore
 from slamcli.sparse_map.sparse_map import SparseMap
 from slamcli.stages import measurements
@@ -79,7 +79,7 @@ def _find(run: RunDir, new: RunDir, config: Config, progress: Progress) -> Local
         PlaceIndex(run.load(Words, "match"), sparse_map.kf.frame),
         FramePoints(coarse_images(run), given, config.sensor).under(run.camera("loop")),
     )
-    recording = Recording(
+    recording = TrackingInput(
         FrameStore(features, camera, config.sensor),
         new.load(Words, "match"),
         new.load(Matches, "match"),

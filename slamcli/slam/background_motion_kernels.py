@@ -16,7 +16,7 @@ LEAST_COSINE = 0.25  # of a surface seen more slantingly, that its area is divid
 SAME_NORMAL = 0.8  # cosine between the normals of points on one surface
 
 
-class Correspondences(NamedTuple):
+class WeightedMatches(NamedTuple):
     """N points of the reference, and where the frame sees them."""
 
     x_r: f8[:, ::1]  # (N, 3) [m]
@@ -28,7 +28,7 @@ class Correspondences(NamedTuple):
 
 
 @kernel
-def vote(T: f8[:, :, ::1], matches: Correspondences, pinhole: f8[::1], chi2: f8, agrees: b1[::1]):
+def vote(T: f8[:, :, ::1], matches: WeightedMatches, pinhole: f8[::1], chi2: f8, agrees: b1[::1]):
     """Find the motion T (M, 3 or 4, 4) with which matches of the greatest total weight agree; write these; return its number and the weight.
 
     The better a match agrees, the more of its weight counts (P. Torr, A. Zisserman, CVIU 2000, doi:10.1006/cviu.1999.0832).

@@ -18,7 +18,7 @@ from slamcli.config.options import SensorConfig
 from slamcli.depth import icp, icp_kernels
 from slamcli.depth.coarse_images import CoarseImages
 from slamcli.depth.icp import OrientedPoints, Pass, PosePrior
-from slamcli.depth.icp_kernels import NormalEquations
+from slamcli.depth.icp_kernels import PoseEquations
 from slamcli.estimation import camera_pose, minimal_solvers
 from slamcli.estimation.camera_pose import PoseEstimate
 from slamcli.estimation.measurements import Measurements
@@ -201,10 +201,10 @@ class StepFinder:
         return self._frame_points[frame]
 
 
-def _votes(common: Common, rows: np.ndarray) -> kernels.Correspondences:
+def _votes(common: Common, rows: np.ndarray) -> kernels.WeightedMatches:
     """Return matches `rows` as the voting kernel takes them."""
     m = common.measured.take(rows)
-    return kernels.Correspondences(common.x_r[rows], m.xy, m.depth, 1.0 / m.sigma_px, 1.0 / m.sigma_z, common.weight[rows])
+    return kernels.WeightedMatches(common.x_r[rows], m.xy, m.depth, 1.0 / m.sigma_px, 1.0 / m.sigma_z, common.weight[rows])
 
 
 def _score(one: Judgement) -> float:
@@ -240,7 +240,7 @@ def _align(T: np.ndarray, source: OrientedPoints, target: OrientedPoints, prior:
     T = np.array(T, dtype=np.float64, order="C")
     pull = product(prior.information, se3.log(product(prior.T, se3.inverse(T))))
     by_surface = (one.points._replace(variance=_variance(one)) for one in (source, target))
-    known, found = NormalEquations(np.ascontiguousarray(prior.information), pull), NormalEquations(np.zeros((6, 6)), np.zeros(6))
+    known, found = PoseEquations(np.ascontiguousarray(prior.information), pull), PoseEquations(np.zeros((6, 6)), np.zeros(6))
     icp_kernels.align(T, *by_surface, target.view, SCHEDULE, icp.RULE, known, found)
     return se3.orthonormalize(T)
 

@@ -20,7 +20,7 @@ SHARED = 30  # landmarks of two key frames whose depth images are aligned too
 
 
 @dataclass(frozen=True)
-class DepthEdges:
+class DepthConstraints:
     """What depth images are to say of how key frames lie to one another."""
 
     points: FramePoints  # of the recording that the map is of
@@ -34,7 +34,7 @@ class Refinement:
     """By what a map and its frames are refined."""
 
     settings: TrackConfig
-    depth: DepthEdges
+    depth: DepthConstraints
     iterations: int  # of the adjustment
 
 

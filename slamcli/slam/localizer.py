@@ -14,7 +14,7 @@ from slamcli.slam.frame_poses import FramePoses
 from slamcli.slam.initial_pose import PreviousFrame
 from slamcli.slam.local_map import LocalMap, MapMatch
 from slamcli.slam.place_recognition import PlaceIndex
-from slamcli.slam.recording import Recording
+from slamcli.slam.recording import TrackingInput
 from slamcli.slam.relocalization import Relocalizer
 from slamcli.sparse_map.guided_matching import FrameFeatures
 from slamcli.sparse_map.sparse_map import SparseMap
@@ -50,7 +50,7 @@ class Localizer:
     def __init__(
         self,
         known: KnownMap,
-        recording: Recording,
+        recording: TrackingInput,
         settings: TrackConfig,
         rng: np.random.Generator,
         *,

@@ -11,7 +11,7 @@ from slamcli.sparse_map.frame import FrameStore
 
 
 @dataclass(frozen=True)
-class Recording:
+class TrackingInput:
     """The frames of a recording: features, words, matches with the frame before, and the oriented points of the depth images."""
 
     frames: FrameStore

@@ -11,7 +11,7 @@ from slamcli.slam.depth_tracking import DepthPlacement
 from slamcli.slam.localizer import KnownMap, Localizer, Location, nothing_seen
 from slamcli.slam.map_growth import MapGrowth
 from slamcli.slam.place_recognition import PlaceIndex
-from slamcli.slam.recording import NOTHING_KNOWN, KnownMotion, Recording
+from slamcli.slam.recording import NOTHING_KNOWN, KnownMotion, TrackingInput
 from slamcli.sparse_map.guided_matching import FrameFeatures
 from slamcli.sparse_map.sparse_map import SparseMap
 
@@ -24,7 +24,7 @@ class Tracker:
     """
 
     def __init__(
-        self, recording: Recording, settings: TrackConfig, rng: np.random.Generator, *, motion: KnownMotion = NOTHING_KNOWN
+        self, recording: TrackingInput, settings: TrackConfig, rng: np.random.Generator, *, motion: KnownMotion = NOTHING_KNOWN
     ) -> None:
         """Begin without a map; motion : what is known of the camera's motion beforehand."""
         self._frames, self._settings, self._background = recording.frames, settings, motion.background

@@ -51,7 +51,7 @@ class Tools(Protocol):
         """Return the stage's own random numbers: the same for the same seed, whatever ran before."""
 
 
-class Run(Protocol):
+class StageFunction(Protocol):
     """The function `run` of a stage's file: load the inputs, call the numerical packages, save what they return."""
 
     def __call__(self, inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:

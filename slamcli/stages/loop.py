@@ -15,7 +15,7 @@ from slamcli.schema import LOST, Closures, DepthTimes, FrameTimes, Map, Moving, 
 from slamcli.slam import doubt, final_refinement, loop_pose_graph, map_segments, pose_doubt
 from slamcli.slam.common_place import Jury
 from slamcli.slam.depth_tracking import FramePoints
-from slamcli.slam.final_refinement import DepthEdges, Refinement
+from slamcli.slam.final_refinement import DepthConstraints, Refinement
 from slamcli.slam.loop_candidates import Candidate
 from slamcli.slam.loop_closing import LoopCloser, Objections, no_objection
 from slamcli.slam.moving_objects import FOR_MAPS
@@ -46,7 +46,7 @@ def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
     accepted = [c for c in tried if c.is_accepted]
     if accepted and cfg.loop.final_refinement:  # now that places seen again coincide
         points = FramePoints(depth, inputs.camera(), cfg.sensor)
-        edges = DepthEdges(points, when, most=cfg.loop.depth_icp_edges, weight=cfg.loop.depth_icp_weight)
+        edges = DepthConstraints(points, when, most=cfg.loop.depth_icp_edges, weight=cfg.loop.depth_icp_weight)
         by, tracked = Refinement(cfg.track, edges, cfg.loop.iterations), TrackedRecording(frames, tracks, inputs.load(Rests, "track"))
         tracks, _ = final_refinement.refine_all(sparse_map, tracked, by, progress=tools.progress, workers=tools.workers)
     map_ = map_segments.anchored(main_first(sparse_map.snapshot(), tracks, cfg.loop.main_segment), tracks)

@@ -13,7 +13,7 @@ from slamcli.config.options import Config
 from slamcli.schema import Features, FrameTimes, Map, Moving, Rests, Timing, Tracks
 from slamcli.slam import calibration_doubt, doubt, final_refinement, map_segments, rests
 from slamcli.slam.depth_tracking import NO_FRAME_POINTS, FramePoints
-from slamcli.slam.final_refinement import DepthEdges, Refinement
+from slamcli.slam.final_refinement import DepthConstraints, Refinement
 from slamcli.slam.recording import TrackedRecording
 from slamcli.sparse_map import map_adjustment
 from slamcli.sparse_map.frame import FrameStore
@@ -78,7 +78,7 @@ def refine(
         cost.append(result.cost[-1])
     sparse_map.features = self_calibration.correct(features, given, sensing)
     frames = FrameStore(sparse_map.features, sensing.camera, cfg.sensor)
-    depth = DepthEdges(extracted.points, sensing.timing, most=cfg.optimize.depth_icp_edges)
+    depth = DepthConstraints(extracted.points, sensing.timing, most=cfg.optimize.depth_icp_edges)
     by, tracked = Refinement(cfg.track, depth, cfg.optimize.iterations), TrackedRecording(frames, tracks, extracted.stands_still)
     tracks, result = final_refinement.refine_all(sparse_map, tracked, by, progress=tools.progress, workers=tools.workers)
     summary = {} if result is None else {"cost": [*cost, result.cost[-1]], "outliers": int((~result.is_inlier).sum())}

@@ -23,7 +23,7 @@ from slamcli.slam.background_motion import BackgroundMotion
 from slamcli.slam.depth_tracking import FramePoints
 from slamcli.slam.depth_views import Views
 from slamcli.slam.moving_objects import UNDER_DRIFT
-from slamcli.slam.recording import KnownMotion, Recording
+from slamcli.slam.recording import KnownMotion, TrackingInput
 from slamcli.slam.tracker import Tracker
 from slamcli.sparse_map.frame import FrameStore
 from slamcli.stages import moving_parts
@@ -86,7 +86,7 @@ def _track(inputs: Inputs, moving: Moving, background: np.ndarray | None, cfg: C
     features, depth = moving_parts.still(inputs, moving)
     words, matches, camera = inputs.load(Words, "match"), inputs.load(Matches, "match"), inputs.camera()
     stands_still = rests.find(features, words, matches, camera) if cfg.track.rests else rests.NONE
-    recording = Recording(FrameStore(features, camera, cfg.sensor), words, matches, FramePoints(depth, camera, cfg.sensor))
+    recording = TrackingInput(FrameStore(features, camera, cfg.sensor), words, matches, FramePoints(depth, camera, cfg.sensor))
     tracker = Tracker(recording, cfg.track, tools.rng(), motion=KnownMotion(background, stands_still))
     for i in tools.progress(range(len(features.stamp)), "track"):
         tracker.process(i)

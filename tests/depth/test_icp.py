@@ -118,8 +118,8 @@ def test_the_gradient_equals_numerical_derivatives():
     source, target = relief(HERE, 3), relief(HERE, 4)
     T = se3.exp(np.array([0.004, -0.003, 0.005, 0.002, -0.001, 0.002]))
     H, b, still = np.zeros((6, 6)), np.zeros(6), np.array([[1.0, 0.05, 1.0, 1.0]])
-    rule, held = icp_kernels.AgreementRule(0.8, np.inf, 1.0), icp_kernels.NormalEquations(1e20 * np.eye(6), np.zeros(6))
-    found = icp_kernels.NormalEquations(H, b)
+    rule, held = icp_kernels.AgreementRule(0.8, np.inf, 1.0), icp_kernels.PoseEquations(1e20 * np.eye(6), np.zeros(6))
+    found = icp_kernels.PoseEquations(H, b)
     met, agree, cost = icp_kernels.align(T.copy(), source.points, target.points, target.view, still, rule, held, found)
 
     q = se3.transform(T, source.xyz.astype(float))

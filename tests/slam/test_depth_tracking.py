@@ -18,8 +18,8 @@ from slamcli.geometry import se3
 from slamcli.schema import KEY_FRAME, LOST, ON_DEPTH, Features, Matches, Timing, Tracks, Words, frame_poses
 from slamcli.slam import final_refinement, loop_pose_graph
 from slamcli.slam.depth_tracking import DepthAligner, FramePoints
-from slamcli.slam.final_refinement import DepthEdges, Refinement
-from slamcli.slam.recording import Recording, TrackedRecording
+from slamcli.slam.final_refinement import DepthConstraints, Refinement
+from slamcli.slam.recording import TrackedRecording, TrackingInput
 from slamcli.slam.tracker import Tracker
 from slamcli.sparse_map import map_adjustment
 from slamcli.sparse_map.frame import FrameStore
@@ -55,7 +55,7 @@ def blind(n: int) -> tuple[Features, Words, Matches]:
 
 def track(depth: CoarseImages, **settings) -> Tracker:
     features, words, matches = blind(len(depth))
-    recording = Recording(FrameStore(features, KINECT, SENSOR), words, matches, FramePoints(depth, KINECT, SENSOR))
+    recording = TrackingInput(FrameStore(features, KINECT, SENSOR), words, matches, FramePoints(depth, KINECT, SENSOR))
     tracker = Tracker(recording, TrackConfig(**settings), np.random.default_rng(0))
     for i in range(len(depth)):
         tracker.process(i)
@@ -202,7 +202,7 @@ def test_a_second_look_joins_key_frames_that_see_the_same_and_moves_them_to_wher
     )
     store = FrameStore(sparse_map.features, KINECT, SENSOR)
     timing = Timing(np.array(0.0), np.array(0.0), np.array(0.0), np.zeros((n, 6)))
-    depth = DepthEdges(FramePoints(coded(corner().of(frames)), KINECT, SENSOR), timing, most=most)
+    depth = DepthConstraints(FramePoints(coded(corner().of(frames)), KINECT, SENSOR), timing, most=most)
     by = Refinement(TrackConfig(), depth, iterations=20)
     after, result = final_refinement.refine_all(sparse_map, TrackedRecording(store, tracks), by, progress=silent)
     assert len(sparse_map.edge) == {0: 0, 1: 3, 6: 6}[most]

@@ -221,7 +221,7 @@ def test_votes_are_counted_as_by_hand() -> None:
     depth, weight = moved[:, 2] + rng.normal(0, 0.01, 60), rng.uniform(0.5, 2.0, 60)
     depth[::7] = np.nan
     agrees = np.zeros(60, dtype=np.bool_)
-    matches = background_motion_kernels.Correspondences(x, np.ascontiguousarray(xy), depth, np.full(60, 1.0), np.full(60, 50.0), weight)
+    matches = background_motion_kernels.WeightedMatches(x, np.ascontiguousarray(xy), depth, np.full(60, 1.0), np.full(60, 50.0), weight)
     best, total = background_motion_kernels.vote(T, matches, pinhole, 9.0, agrees)
     expected, shares = [], []
     for pose in T:
