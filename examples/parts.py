@@ -17,7 +17,7 @@ from slamcli.estimation import bundle_adjustment
 from slamcli.estimation.bundle_problem import Problem, Variables
 from slamcli.geometry import octree, se3
 from slamcli.schema import LOST, Features, Map, Matches, Tracks, Words, frame_poses
-from slamcli.slam.recording import Recording
+from slamcli.slam.recording import TrackingInput
 from slamcli.slam.tracker import Tracker
 from slamcli.sparse_map import map_adjustment
 from slamcli.sparse_map.frame import FrameStore
@@ -40,7 +40,7 @@ def track(run: slamcli.Run, n_frames: int = 40) -> tuple[Tracks, Map]:
     )
     config = run.config()
     frames = FrameStore(features, run.camera("extract"), config.sensor)
-    tracker = Tracker(Recording(frames, words, matches), config.track, np.random.default_rng(config.seed))
+    tracker = Tracker(TrackingInput(frames, words, matches), config.track, np.random.default_rng(config.seed))
     n_frames = min(n_frames, len(features.stamp))
     for i in range(n_frames):
         tracker.process(i)
