@@ -117,8 +117,8 @@ class _LastOpened:
     def __init__(self) -> None:
         self._kept: tuple[Job, Config, Dataset] | None = None
 
-    def recording_of(self, job: Job, target: str = "", config: Config | None = None) -> Dataset | None:
-        """Return the recording of a job, opened under the same configuration, if that is the last; None otherwise."""
+    def recording_of(self, job: Job, config: Config | None = None) -> Dataset | None:
+        """Return the recording of a job, opened under the same configuration where one is given, if that is the last; None otherwise."""
         if self._kept is None or self._kept[0] != job:
             return None
         _, under, dataset = self._kept
@@ -175,7 +175,11 @@ class Desk:
         target, order = self.open(stage), self.job.order
         logging.getLogger("slamcli").setLevel(logging.DEBUG)  # a run's log.txt has everything, here as from the command line
         directory, dataset, config = create_run(
-            [target], resolve=self._resolve, path=self.directory.path, data=order.data, opened=partial(_last.recording_of, self.job)
+            [target],
+            resolve=self._resolve,
+            path=self.directory.path,
+            data=order.data,
+            opened=lambda _, config: _last.recording_of(self.job, config),
         )
         _last.keep(self.job, config, dataset)
         # Another process may still be at it for a client that has died since: what it makes is then found up to date.

@@ -1,6 +1,7 @@
 """extract: images -> ORB features with depth."""
 
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -95,8 +96,10 @@ class _Gathered:
     def __init__(self, out: Path, camera: Camera, settings: ExtractConfig) -> None:
         self._camera, self._settings = camera, settings
         self._no_depth = coarse_images.code_of(np.zeros(icp.coarse_shape(camera), np.uint16))
-        self._features = artifacts.Writer(Features, out, "xy", "depth", "slope", "octave", "angle", "desc")
-        self._coarse = artifacts.Writer(CoarseDepth, out, "coarse_code")
+        with ExitStack() as opened:
+            self._features = opened.enter_context(artifacts.Writer(Features, out, "xy", "depth", "slope", "octave", "angle", "desc"))
+            self._coarse = opened.enter_context(artifacts.Writer(CoarseDepth, out, "coarse_code"))
+            self._writers = opened.pop_all()
         self._coarse_offset = [0]
         self.offset = [0]
         self.n_with_depth = 0  # features
@@ -110,8 +113,7 @@ class _Gathered:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        self._features.__exit__(kind, error, trace)
-        self._coarse.__exit__(kind, error, trace)
+        self._writers.close()
 
     def add(self, frame: Frame) -> None:
         """Add the next frame."""

@@ -15,9 +15,8 @@ NONE = -1  # there is no further point
 class _Trees(NamedTuple):
     """The leaves of the quadtrees of all levels, and the points in each."""
 
-    node: i4[
-        :, ::1
-    ]  # (sum of wanted + 3 for each level, NODE_COLUMNS); a level's begin where those of the levels before would all find room
+    # (sum of wanted + 3 for each level, NODE_COLUMNS); a level's begin where those of the levels before would all find room
+    node: i4[:, ::1]
     n_nodes: i8[::1]  # (levels,)
     following: i4[::1]  # (N,) the next point in the same node
 
