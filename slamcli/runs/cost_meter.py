@@ -15,7 +15,7 @@ from slamcli.console import Tell
 from slamcli.jit.compilation import COMPILING
 
 SAMPLING = 0.02  # [s] between looks at the resident memory
-MUCH = 512.0  # [MiB] taken by a stage, from which on 50 ms of looking for what can be freed are worth it
+MUCH = 256.0  # [MiB] taken by a stage, from which on 50 ms and more of looking for what can be freed are worth it
 
 
 class Meter:
@@ -26,10 +26,11 @@ class Meter:
 
     seconds = cpu_seconds = compile_seconds = 0.0
     peak_rss_mb = 0.0
+    _before_mb = 0.0
     _watch: Any = None
 
     def __enter__(self) -> "Meter":
-        self._done = threading.Event()
+        self._done, self._before_mb = threading.Event(), _resident_mb()
         self._sampler = threading.Thread(target=self._sample, name="slamcli-memory", daemon=True)
         self._start, self._cpu_start = time.perf_counter(), time.process_time()
         self._sampler.start()
@@ -45,6 +46,11 @@ class Meter:
 
             event.unregister("numba:compile", self._watch)
             self.compile_seconds = self._watch.total
+
+    @property
+    def taken_mb(self) -> float:
+        """Return by how much memory has grown at its peak [MiB]."""
+        return self.peak_rss_mb - self._before_mb
 
     def watch_compiler(self, tell: Tell) -> None:
         """Count compilation from here on, if numba has been imported by now; `tell` hears of the first."""
@@ -68,12 +74,12 @@ class Meter:
                 return
 
 
-def return_free_memory(peak_mb: float) -> None:
+def return_free_memory(taken_mb: float) -> None:
     """Hand what a stage left back to the system, where the C library can: else it would count as the next stage's too.
 
-    peak_mb : what the stage took; where that is much, what its objects hold by referring to one another is looked for too
+    taken_mb : what the stage took; where that is much, what its objects hold by referring to one another is looked for too
     """
-    if peak_mb > MUCH:
+    if taken_mb > MUCH:
         gc.collect()
     with contextlib.suppress(OSError, AttributeError):  # a C library other than glibc
         ctypes.CDLL(None).malloc_trim(0)

@@ -263,7 +263,7 @@ class Pipeline:
             self.run.commit(stage.name, out, record)
         log.debug("%s", record)
         self._tell(stage_line(record))
-        return_free_memory(meter.peak_rss_mb)
+        return_free_memory(meter.taken_mb)
 
     def _present_input(self, name: str) -> str:
         if name in NAMES:
