@@ -90,8 +90,8 @@ def test_an_interruption_ends_the_processes_that_compile(monkeypatch: pytest.Mon
 
 def test_the_processes_really_compile_and_leave_their_kernels_in_the_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(cache, "folder", lambda: tmp_path / "kernels")
-    few = "import sys; from slamcli.jit import compilation; compilation.PACKAGES = ('geometry',); compilation.compile_share(0, 1)"
-    monkeypatch.setattr(compilation, "CHILD", few)
+    one = "import sys; from slamcli.jit import compilation; compilation.PACKAGES = ('geometry',); compilation.compile_share(20, 21)"
+    monkeypatch.setattr(compilation, "CHILD", one)
     names = list(compilation.compile_all(1))
     assert names
     assert len(list(tmp_path.rglob("*.nbc"))) >= len(names)
@@ -110,8 +110,8 @@ def test_a_full_folder_is_told_and_not_taken_for_a_finished_one(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(cache, "folder", lambda: tmp_path / "kernels")
-    few = "import sys; from slamcli.jit import compilation; compilation.PACKAGES = ('geometry',); compilation.compile_share(0, 1)"
-    monkeypatch.setattr(compilation, "CHILD", few)
+    one = "import sys; from slamcli.jit import compilation; compilation.PACKAGES = ('geometry',); compilation.compile_share(20, 21)"
+    monkeypatch.setattr(compilation, "CHILD", one)
     with largest_file(500):
         compilation.ensure()
     assert "kernels: not every kernel could be kept there" in caplog.text
