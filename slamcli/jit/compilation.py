@@ -2,6 +2,7 @@
 
 import contextlib
 import fcntl
+import functools
 import hashlib
 import importlib
 import logging
@@ -45,7 +46,7 @@ def ensure(*, progress: Progress = silent, tell: Tell = log.info) -> None:
     """Compile what the run will call, if that was not done on this machine for these sources."""
     from slamcli.jit import cache
 
-    done = cache.folder() / f"compiled-{_digest()}"
+    done = cache.folder() / f"compiled-{_digest(PACKAGES)}"
     if done.exists():
         return
     with _alone(done):
@@ -128,10 +129,14 @@ def _cores() -> int:
     return min(cores, MOST_PROCESSES)
 
 
-def _digest() -> str:
-    """Digest what compiled kernels depend on, and where their sources are: numba keeps them apart by that too."""
+@functools.cache
+def _digest(packages: tuple[str, ...]) -> str:
+    """Digest what compiled kernels depend on, and where their sources are: numba keeps them apart by that too.
+
+    Once a process: a source that changes later is not imported again.
+    """
     digest = hashlib.sha256(f"{platform.node()} {platform.python_version()} {version('numba')} {PACKAGE}".encode())
-    for package in PACKAGES:
+    for package in packages:
         for source in sorted((PACKAGE / package).glob("*.py")):
             digest.update(source.read_bytes())
     return digest.hexdigest()[:12]
