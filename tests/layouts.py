@@ -359,6 +359,9 @@ class RosMessages:
     """Which messages a bag holds, and how."""
 
     colour: str = "jpeg"
+    colour_topic: str = "/camera/color/image_raw"
+    projection: dict[str, float] | None = None  # P of colour's CameraInfo; zeros without
+    is_raw_told: bool = True  # K and D of colour's CameraInfo; zeros if not
     depth: str = "32FC1"
     depth_frame: str = "color_optical"
     depth_topic: str = "/camera/depth_registered/image_raw"
@@ -385,16 +388,18 @@ def write_ros(writer: object, content: Content, how: RosMessages, *, is_cdr: boo
         extra = {} if is_cdr else {"seq": 0}
         return types["std_msgs/msg/Header"](stamp=when, frame_id=frame, **extra)
 
-    def info(camera: dict[str, float], stamp: int, frame: str) -> object:
+    def info(camera: dict[str, float], stamp: int, frame: str, projection: dict[str, float] | None = None) -> object:
         upper = (lambda name: name) if is_cdr else str.upper
         region = types["sensor_msgs/msg/RegionOfInterest"](x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
         d = np.array([camera.get(key, 0.0) for key in ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")])
         model = "rational_polynomial" if d[5:].any() else "plumb_bob"
         p = np.zeros(12)
+        if projection is not None:
+            p.reshape(3, 4)[:, :3] = np.reshape(k_rows(projection), (3, 3))
         return types["sensor_msgs/msg/CameraInfo"](
             header=header(stamp, frame), height=int(camera["height"]), width=int(camera["width"]), distortion_model=model,
             binning_x=0, binning_y=0, roi=region,
-            **{upper("d"): d if d[5:].any() else d[:5], upper("k"): np.array(k_rows(camera)), upper("r"): np.eye(3).ravel(), upper("p"): p},
+            **{upper("d"): d if d[5:].any() else d[:5], upper("k"): np.array(k_rows(camera) if camera["fx"] else [0.0] * 9), upper("r"): np.eye(3).ravel(), upper("p"): p},
         )  # fmt: skip
 
     def raw(image: np.ndarray, encoding: str, stamp: int, frame: str) -> object:
@@ -429,7 +434,7 @@ def write_ros(writer: object, content: Content, how: RosMessages, *, is_cdr: boo
         raise ValueError(depth)
 
     def colour_message(i: int) -> tuple[str, str, object]:
-        stamp, name = content.stamp[i], "/camera/color/image_raw"
+        stamp, name = content.stamp[i], how.colour_topic
         if how.colour == "jpeg":
             kind = "rgb8; jpeg compressed bgr8" if content.suffix == ".jpg" else "rgb8; png compressed bgr8"
             return f"{name}/compressed", SENSOR_COMPRESSED, compressed(content.colour[i], kind, stamp, "color_optical")
@@ -437,7 +442,10 @@ def write_ros(writer: object, content: Content, how: RosMessages, *, is_cdr: boo
         return name, SENSOR_IMAGE, raw(image, how.colour, stamp, "color_optical")
 
     messages: list[tuple[int, str, str, object]] = []
-    depth_space = depth_topic.rsplit("/", 1)[0]
+    colour_space, depth_space = (topic.rsplit("/", 1)[0] for topic in (how.colour_topic, depth_topic))
+    colour_camera = (
+        content.camera if how.is_raw_told else dict.fromkeys(content.camera, 0.0) | {k: content.camera[k] for k in ("width", "height")}
+    )
     for i in range(len(content.stamp)):
         at = max(content.stamp[i], content.depth_stamp[i]) + 5_000_000
         if "colour" not in how.skip:
@@ -451,7 +459,9 @@ def write_ros(writer: object, content: Content, how: RosMessages, *, is_cdr: boo
             messages.append((at + 3, "/camera/depth/image_rect_raw", SENSOR_IMAGE, unregistered))
         if "info" not in how.skip:
             kind = "sensor_msgs/msg/CameraInfo"
-            messages.append((at, "/camera/color/camera_info", kind, info(content.camera, content.stamp[i], "color_optical")))
+            messages.append(
+                (at, f"{colour_space}/camera_info", kind, info(colour_camera, content.stamp[i], "color_optical", how.projection))
+            )
             messages.append(
                 (at, f"{depth_space}/camera_info", kind, info(how.depth_camera or content.camera, content.stamp[i], depth_frame))
             )

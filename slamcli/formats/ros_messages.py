@@ -36,6 +36,7 @@ class CameraInfo:
     model: str
     d: list[float]
     k: list[float]  # 3 x 3, row by row
+    p: list[float]  # 3 x 4, row by row: the projection of the rectified image; zeros where nobody set it
 
 
 @dataclass(frozen=True)
@@ -128,7 +129,8 @@ def camera_info(data: bytes, *, is_cdr: bool) -> CameraInfo:
         height, width, model = int(cursor.number("I")), int(cursor.number("I")), cursor.text()
         n = int(cursor.number("I"))
         d = cursor.numbers(n) if n <= 64 else []
-        return CameraInfo(frame_id, width, height, model, d, cursor.numbers(9))
+        k, _, p = cursor.numbers(9), cursor.numbers(9), cursor.numbers(12)
+        return CameraInfo(frame_id, width, height, model, d, k, p)
     except struct.error as error:
         raise SlamError(f"a CameraInfo message is cut off or of another kind ({error})") from error
 

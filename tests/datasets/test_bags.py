@@ -1,6 +1,7 @@
 """What only bags have: topics to choose from, transforms, messages out of order, and files that are none."""
 
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -70,6 +71,30 @@ def test_a_missing_topic_is_told_with_those_that_are_there(content: Content, tmp
 def test_without_camera_info_the_numbers_are_asked_for(content: Content, tmp_path: Path, kind: str) -> None:
     with pytest.raises(SlamError, match="no calibration: fx, fy, cx, cy are missing"):
         opened(content, tmp_path, kind, skip=("info",))
+
+
+STRAIGHT = {"fx": 50.0, "fy": 51.0, "cx": 30.0, "cy": 22.0}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    ("topic", "projection", "is_raw_told", "is_rectified"),
+    [
+        ("/camera/rgb/image_rect_color", STRAIGHT, True, True),
+        ("/camera/rgb/image_raw", STRAIGHT, True, False),  # P is there, and the images are as the lens made them
+        ("/camera/rgb/image_raw", STRAIGHT, False, True),  # nothing else is known
+        ("/camera/rgb/image_rect_color", None, True, False),  # P was never set
+        ("/camera/direct/image_raw", STRAIGHT, True, False),  # no word of its own
+    ],
+)
+def test_rectified_images_have_the_intrinsics_of_p_and_no_distortion(
+    content: Content, tmp_path: Path, kind: str, topic: str, projection: dict | None, is_raw_told: bool, is_rectified: bool
+) -> None:
+    bent = replace(content, camera={**content.camera, "k1": 0.2, "k2": -0.1})
+    dataset = opened(bent, tmp_path, kind, colour_topic=topic, projection=projection, is_raw_told=is_raw_told)
+    camera = dataset.camera
+    assert camera.is_distorted != is_rectified
+    assert [camera.fx, camera.fy, camera.cx, camera.cy] == [(STRAIGHT if is_rectified else bent.camera)[key] for key in STRAIGHT]
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -1,5 +1,7 @@
 """ROS 1 .bag, ROS 2 folder and bare .mcap or .db3: a topic of colour, one of depth, their CameraInfo and tf."""
 
+import re
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +22,7 @@ INFO = "sensor_msgs/msg/CameraInfo"
 TF_KINDS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 MILLIMETRES = 1000.0
 REGISTERED = ("aligned", "registered")
+RECTIFIED = {"rect", "rectified"}
 NOT_COLOUR = ("infra", "/ir/", "fisheye", "left", "right", "gray", "mono", "thermal", "confidence", "label", "mask", "debug")
 COLOUR_WORDS = ("color", "colour", "rgb")
 MOST_TF_MESSAGES = 2000  # read in search of where the cameras sit
@@ -47,12 +50,13 @@ def of_bag(bag: Bag, path: Path, *, reader: str) -> Recorded:
     colour_images, depth_images = TopicImages(bag, path, colour), TopicImages(bag, path, depth)
     (stamp, note), (depth_stamp, depth_note) = colour_images.stamps(), depth_images.stamps()
     said += [f"{path}: {text}" for text in dict.fromkeys((note, depth_note)) if text]
-    calibration = Calibration(intrinsics(info), f"{path}: CameraInfo of {colour.name}") if info else Calibration({})
-    if info and depth_info and not _is_registered(depth.name, depth_image, picture, info, depth_info):
+    calibration = Calibration(intrinsics(info, colour.name), f"{path}: CameraInfo of {colour.name}") if info else Calibration({})
+    depth_values = intrinsics(depth_info, depth.name) if depth_info else {}
+    if info and depth_info and not _is_registered(depth.name, depth_image, picture, calibration.values, depth_values):
         T_cd = _pose(bag, picture.frame_id or info.frame_id, depth_image.frame_id or depth_info.frame_id)
         if T_cd is None:
             said.append(f"{path}: tf does not say where the depth camera sits; it is taken to be where colour is")
-        calibration = Calibration(calibration.values, calibration.source, intrinsics(depth_info), T_cd)
+        calibration = Calibration(calibration.values, calibration.source, depth_values, T_cd)
     is_float = depth_image.encoding.lower().startswith(("32fc1", "64fc1"))
     return Recorded(
         reader=reader,
@@ -65,11 +69,22 @@ def of_bag(bag: Bag, path: Path, *, reader: str) -> Recorded:
     )
 
 
-def intrinsics(info: CameraInfo) -> dict:
-    """Return a CameraInfo as keys of Camera."""
-    k = info.k
+def intrinsics(info: CameraInfo, topic: str) -> dict:
+    """Return a CameraInfo as keys of Camera, for the images of a topic.
+
+    Rectified ones (``image_rect``, ``image_rect_color``) are free of distortion and belong to P; K and D are of the image before. Where
+    one of K and P is not set, the other holds.
+    """
+    k, p = info.k, info.p
     size = {"width": info.width, "height": info.height} if info.width and info.height else {}
+    if p[0] > 0.0 and (k[0] <= 0.0 or is_rectified(topic)):
+        return {**size, "fx": p[0], "fy": p[5], "cx": p[2], "cy": p[6]}
     return {**size, "fx": k[0], "fy": k[4], "cx": k[2], "cy": k[5], **distortion(info.d, info.model)}
+
+
+def is_rectified(topic: str) -> bool:
+    """Say whether a topic's name, in the convention of ROS' image pipeline, promises images without distortion."""
+    return not RECTIFIED.isdisjoint(re.split(r"[/_]", topic.lower()))
 
 
 def _choose(bag: Bag, path: Path, what: str, said: list[str]) -> tuple[Topic, Image]:
@@ -122,17 +137,20 @@ def _read_info(bag: Bag, topic: Topic) -> CameraInfo | None:
             info = ros_messages.camera_info(bag.read(place), is_cdr=bag.is_cdr)
         except SlamError:
             continue
-        if info.k[0] > 0.0:
+        if info.k[0] > 0.0 or info.p[0] > 0.0:
             return info
     return None
 
 
-def _is_registered(name: str, depth: Image, colour: Image, info: CameraInfo, depth_info: CameraInfo) -> bool:
+def _is_registered(name: str, depth: Image, colour: Image, of_colour: Mapping, of_depth: Mapping) -> bool:
     """Say whether depth lies on colour already: by its name, its frame, or equal intrinsics."""
     if any(word in name.lower() for word in REGISTERED):
         return True
-    same_view = abs(depth_info.k[0] / max(depth_info.width, 1) / (info.k[0] / max(info.width, 1)) - 1.0) < SAME
-    return same_view and (depth.frame_id == colour.frame_id or np.allclose(depth_info.k, info.k, rtol=SAME))
+    of_both = (of_depth, of_colour)
+    depth_view, colour_view = (values["fx"] / values.get("width", 1) for values in of_both)
+    is_same_view = abs(depth_view / colour_view - 1.0) < SAME
+    pinholes = [[values[key] for key in ("fx", "fy", "cx", "cy")] for values in of_both]
+    return is_same_view and (depth.frame_id == colour.frame_id or np.allclose(*pinholes, rtol=SAME))
 
 
 def _pose(bag: Bag, frame: str, depth_frame: str) -> np.ndarray | None:
