@@ -146,11 +146,10 @@ def _is_registered(name: str, depth: Image, colour: Image, of_colour: Mapping, o
     """Say whether depth lies on colour already: by its name, its frame, or equal intrinsics."""
     if any(word in name.lower() for word in REGISTERED):
         return True
-    of_both = (of_depth, of_colour)
-    depth_view, colour_view = (values["fx"] / values.get("width", 1) for values in of_both)
-    is_same_view = abs(depth_view / colour_view - 1.0) < SAME
-    pinholes = [[values[key] for key in ("fx", "fy", "cx", "cy")] for values in of_both]
-    return is_same_view and (depth.frame_id == colour.frame_id or np.allclose(*pinholes, rtol=SAME))
+    view, colour_view = (values["fx"] / values.get("width", 1) for values in (of_depth, of_colour))
+    pinhole, colour_pinhole = ([values[key] for key in ("fx", "fy", "cx", "cy")] for values in (of_depth, of_colour))
+    is_same_view = abs(view / colour_view - 1.0) < SAME
+    return is_same_view and (depth.frame_id == colour.frame_id or np.allclose(pinhole, colour_pinhole, rtol=SAME))
 
 
 def _pose(bag: Bag, frame: str, depth_frame: str) -> np.ndarray | None:
