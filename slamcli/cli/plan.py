@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from slamcli.navigation.planner import Route
+    from slamcli.navigation.reach import Gap
     from slamcli.navigation.walls import Wall
     from slamcli.runs.run_directory import RunDir
     from slamcli.schema import Grid
@@ -102,13 +103,13 @@ def plan(
         grid, title = _read_map(page), page.name
     radius = Config().robot.radius if radius is None else radius
     if reachable:
-        start = _ends(grid, {"start": start}, trajectory, radius=radius, allow_unknown=allow_unknown)["start"]
+        start = _ends(grid, {"start": start}, trajectory, radius=radius, allow_unknown=allow_unknown)[0]["start"]
         walls = _walls(folder, grid) if page is None else []
         _tell_reachable(grid, start, radius, allow_unknown, walls, png, as_json)
         return
     if goal is None:
         raise click.UsageError("give --goal, or --reachable")
-    ends = _ends(grid, {"start": start, "goal": goal}, trajectory, radius=radius, allow_unknown=allow_unknown)
+    ends, moved = _ends(grid, {"start": start, "goal": goal}, trajectory, radius=radius, allow_unknown=allow_unknown)
     start, goal = ends["start"], ends["goal"]
     try:
         route = planner.plan(grid, start, goal, radius=radius, clearance=clearance, weight=weight, allow_unknown=allow_unknown)
@@ -116,8 +117,10 @@ def plan(
         if png is None:
             raise
         _draw_reach(png, grid, [start, goal], radius, allow_unknown, trajectory)
-        raise SlamError(f"{error}; {png} shows what can be reached from the start") from error
-    texts = {".csv": _csv(route), ".json": _json(route, start, goal, radius)}
+        raise SlamError(
+            f"{error}; {png} shows what can be reached from the start{_gap_before(grid, start, goal, radius, allow_unknown)}"
+        ) from error
+    texts = {".csv": _csv(route), ".json": _json(route, start, goal, radius, moved)}
     if out is not None:
         _write(out, texts)
     if png is not None:
@@ -193,12 +196,36 @@ def _tell_reachable(
         click.echo(json.dumps({"start": _rounded(start), "radius": radius, **found.to_dict()}))
         return
     drawn = f"; drawn in {png}" if png else ""
-    click.echo(f"{found.reached_area:.1f} of {found.free_area:.1f} m2 of free floor are within reach{drawn}")
+    share = found.reached_area / found.free_area if found.free_area else 0.0
+    click.echo(f"{found.reached_area:.1f} of {found.free_area:.1f} m2 of free floor are within reach ({share:.0%}){drawn}")
+    if found.gap is not None:
+        click.echo(f"{found.area_beyond:.1f} m2 lie beyond {_told(found.gap)}")
     if found.rooms_left_out:
         left = ", ".join(
             f"room {room.number} of {room.area:.1f} m2 at {room.middle[0]:.1f},{room.middle[1]:.1f}" for room in found.rooms_left_out
         )
         click.echo(f"out of reach: {left}")
+
+
+def _told(gap: Gap) -> str:
+    """Say where a way is too narrow, and what can be done about it."""
+    x, y = gap.xy
+    if gap.is_unseen:
+        return f"a gap of {gap.width:.2f} m at {x:.2f},{y:.2f}, beside cells that were never seen: look there, or try --allow-unknown"
+    return f"a gap of {gap.width:.2f} m at {x:.2f},{y:.2f}, beside an obstacle"
+
+
+def _gap_before(grid: Grid, start: tuple[float, float], goal: tuple[float, float], radius: float, allow_unknown: bool) -> str:
+    import numpy as np
+
+    from slamcli.navigation import planner
+    from slamcli.navigation.reach import widest_gap
+
+    there = np.zeros(grid.state.shape, dtype=np.bool_)
+    row, column = planner.cells_of(grid, np.array(goal))
+    there[row, column] = True
+    gap = widest_gap(grid, start, there, radius=radius, allow_unknown=allow_unknown)
+    return "" if gap is None else f"; the way leads through {_told(gap)}"
 
 
 def _draw_reach(
@@ -216,8 +243,8 @@ def _draw_reach(
 
 def _ends(
     grid: Grid, given: dict[str, tuple[float, ...] | str], path: np.ndarray | None, *, radius: float, allow_unknown: bool
-) -> dict[str, tuple[float, float]]:
-    """Turn `first` and `last` into places where the robot has room, and say how far these are from the camera's."""
+) -> tuple[dict[str, tuple[float, float]], dict[str, float]]:
+    """Turn `first` and `last` into places where the robot has room, and say how far [m] these are from the camera's; returns both."""
     import numpy as np
 
     from slamcli.errors import SlamError
@@ -225,20 +252,18 @@ def _ends(
 
     places = {name: (end[0], end[1]) for name, end in given.items() if not isinstance(end, str)}
     if len(places) == len(given):
-        return places
+        return places, {}
     if path is None:
         raise SlamError("--map: a map file does not tell where a camera was; give --start and --goal as x,y")
     known = path[np.isfinite(path).all(axis=1)]
     cameras = {name: known[0 if end == "first" else -1, :2] for name, end in given.items() if isinstance(end, str)}
-    found = planner.nearest_room(
-        grid, [(float(x), float(y)) for x, y in cameras.values()], radius=radius, allow_unknown=allow_unknown, fixed=list(places.values())
-    )
-    for (name, camera), place in zip(cameras.items(), found, strict=True):
-        off = float(np.linalg.norm(camera - place))
+    found = planner.nearest_room(grid, [(float(x), float(y)) for x, y in cameras.values()], radius=radius, allow_unknown=allow_unknown)
+    moved = {name: float(np.linalg.norm(camera - place)) for (name, camera), place in zip(cameras.items(), found, strict=True)}
+    for (name, off), place in zip(moved.items(), found, strict=True):
         if off > float(grid.resolution):
             click.echo(f"{name}: {place[0]:.2f},{place[1]:.2f}, the nearest place with room, {off:.2f} m from below the camera", err=True)
         places[name] = place
-    return places
+    return places, moved
 
 
 def _csv(route: Route) -> str:
@@ -246,9 +271,10 @@ def _csv(route: Route) -> str:
     return "x,y,clearance\n" + "".join(lines)
 
 
-def _json(route: Route, start: tuple[float, float], goal: tuple[float, float], radius: float) -> str:
+def _json(route: Route, start: tuple[float, float], goal: tuple[float, float], radius: float, moved: dict[str, float]) -> str:
     about = {
         "frame": "level", "start": _rounded(start), "goal": _rounded(goal), "radius": radius, "length": round(route.length, 4),
+        "moved": {name: round(metres, 4) for name, metres in moved.items()},
         "points": [_rounded(xy) for xy in route.xy],
         "clearance": [round(float(v), 4) if v < 1e9 else None for v in route.clearance],
     }  # fmt: skip

@@ -130,9 +130,9 @@ def _tell_made(rundir: "RunDir") -> None:
         for name, told in (*placement.lines(where), ("map", verdict.summary)):
             console.say(f"{name:<10}  {told}")
         for finding in verdict.findings:
-            console.say(console.amber(f"{'amber' if finding.is_grave else 'note':<10}  {finding.message}"))
+            console.say(console.amber(f"{'problem' if finding.is_grave else 'note':<10}  {finding.message}"))
             console.say(console.amber(f"{'':<10}  -> {finding.remedy}"))
-    console.say("next: " + "\n      ".join(summary.next_commands(rundir)))
+    console.say("next: " + "\n      ".join(summary.next_commands(rundir, is_usable=verdict is None or verdict.is_usable)))
 
 
 def _place_and_verdict(rundir: "RunDir") -> "tuple[Placement | None, Verdict | None]":
@@ -156,7 +156,7 @@ def _made_object(rundir: "RunDir") -> dict[str, Any]:
     return summary.to_dict(rundir) | {
         "frames": where.to_dict() if where is not None else None,
         "map": verdict.to_dict() if verdict is not None else None,
-        "next": summary.next_commands(rundir),
+        "next": summary.next_commands(rundir, is_usable=verdict is None or verdict.is_usable),
     }
 
 

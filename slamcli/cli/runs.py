@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
 @click.argument("folder", default="runs", type=click.Path(path_type=Path, file_okay=False))
 @json_option
 def list_command(folder: Path, as_json: bool) -> None:
-    """List the runs below FOLDER (runs): recording, stages, frames with a pose, size on disk. The star marks the last one touched."""
+    """List the runs below FOLDER (runs): recording, stages, frames with a pose, size on disk. The star marks the last one that run or add made."""
     from slamcli import console
     from slamcli.runs import housekeeping
 
@@ -63,6 +64,8 @@ def clean_command(run: str | None, keep: str, as_json: bool) -> None:
     from slamcli.runs.run_directory import RunDir
 
     folder = RunDir.find(run)
+    if run is None and "SLAMCLI_RUN" not in os.environ:
+        raise click.UsageError(f"say whose files are to be deleted; the run made last is that of: {folder.flag}")
     freed = housekeeping.clean(folder)
     if as_json:
         click.echo(json.dumps({"run": str(folder.path), "kept": keep, "freed": freed}))
@@ -76,8 +79,9 @@ def clean_command(run: str | None, keep: str, as_json: bool) -> None:
 @click.argument("out", type=Target())
 @run_option
 @click.option("--results", is_flag=True, help="Leave out the files that only stages read.")
+@click.option("--overwrite", is_flag=True, help="Even where OUT is an archive of more than this one.")
 @json_option
-def archive_command(out: Path, run: str | None, results: bool, as_json: bool) -> None:
+def archive_command(out: Path, run: str | None, results: bool, overwrite: bool, as_json: bool) -> None:
     """Pack a run into OUT (.zip), whole or only its results; unpacked anywhere, it is a run again.
 
     \b
@@ -88,7 +92,7 @@ def archive_command(out: Path, run: str | None, results: bool, as_json: bool) ->
 
     check_ending(out, ".zip")
     folder = RunDir.find(run)
-    n = housekeeping.archive(folder, out, skip=housekeeping.NO_RESULTS if results else ())
+    n = housekeeping.archive(folder, out, skip=housekeeping.NO_RESULTS if results else (), overwrite=overwrite)
     if as_json:
         click.echo(json.dumps({"out": str(out), "files": n, "bytes": out.stat().st_size}))
     else:

@@ -124,14 +124,15 @@ def _too_high(e: MapEvidence, seen: str, max_range: float) -> MapFinding:
 
 
 def _small(e: MapEvidence) -> MapFinding:
-    message = f"only {e.free_area:.1f} m2 of free floor, and the camera passed over {e.path_area:.1f} m2"
+    camera = f"{e.camera_height:.1f} m high and looking {e.camera_pitch_deg:.0f} degrees down, it saw floor in {e.views_with_floor} of {e.views} views"
+    message = f"only {e.free_area:.1f} m2 of free floor, and the camera passed over {e.path_area:.1f} m2: {camera}"
     return MapFinding(SMALL, message, "walk through the room with the floor ahead in view")
 
 
 def _path(e: MapEvidence) -> list[MapFinding]:
     if e.path_known >= LEAST_PATH:
         return []
-    message = f"{1 - e.path_known:.0%} of the camera's path lie in space never seen, so no path can be planned from its start"
+    message = f"{1 - e.path_known:.0%} of the camera's path lie in space never seen: a robot's path can only begin beside it"
     return [MapFinding(OFF_PATH, message, "look at the floor before you walk over it")]
 
 

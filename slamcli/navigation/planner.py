@@ -52,23 +52,21 @@ def plan(
     margin = room(grid, radius=radius, allow_unknown=allow_unknown)
     ends = [end_cell(grid, margin, name, xy, radius) for name, xy in (("start", start), ("goal", goal))]
     cost = _cell_cost(margin, clearance, weight)
-    cells = _cheapest(cost, ends[0], ends[1])
+    cells = cheapest(cost, ends[0], ends[1])
     if cells is None:
         raise NoWay(_unreachable(grid, cost, ends, allow_unknown))
     corners = pull_tight(cost, cells)
     xy = (corners[:, ::-1] + 0.5) * float(grid.resolution) + grid.origin
     xy = dense(np.concatenate([[start], xy[1:-1], [goal]]) if len(xy) > 1 else np.array([start, goal]), float(grid.resolution))
-    rows, columns = _cells_of(grid, xy)
+    rows, columns = cells_of(grid, xy)
     return Route(xy=xy, clearance=margin[rows, columns], length=float(np.linalg.norm(np.diff(xy, axis=0), axis=1).sum()))
 
 
-def nearest_room(
-    grid: Grid, places: Sequence[tuple[float, float]], *, radius: float, allow_unknown: bool, fixed: Sequence[tuple[float, float]] = ()
-) -> list[tuple[float, float]]:
+def nearest_room(grid: Grid, places: Sequence[tuple[float, float]], *, radius: float, allow_unknown: bool) -> list[tuple[float, float]]:
     """Find, near each of `places` [m, level frame], one where a robot has room, all within one region that it can drive through.
 
-    The region is the one that moves them least, pockets left out; `fixed` places that are in one decide it. A camera does not see the
-    floor below itself, so where it stood is often unknown. Raises SlamError where the robot fits nowhere.
+    The region is the one that moves them least, pockets left out. A camera does not see the floor below itself, so where it stood is often
+    unknown. Raises SlamError where the robot fits nowhere.
     """
     from scipy import ndimage
 
@@ -82,10 +80,6 @@ def nearest_room(
     cells = np.bincount(labels.ravel(), minlength=n_regions + 1)[1:]
     index = 1 + np.flatnonzero(cells >= POCKET * cells.max())
     best = index[np.argmin(np.sum([ndimage.minimum(d, region, index) for d in distance], axis=0))]
-    for place in fixed:
-        row, column = (int(i) for i in _cells_of(grid, np.array(place)))
-        if 0 <= row < labels.shape[0] and 0 <= column < labels.shape[1] and labels[row, column]:
-            best = labels[row, column]
     found = [np.flatnonzero(region == best)[d[region == best].argmin()] for d in distance]
     return [(float(xy[i, 0]), float(xy[i, 1])) for i in found]
 
@@ -93,7 +87,7 @@ def nearest_room(
 def room(grid: Grid, *, radius: float, allow_unknown: bool) -> np.ndarray:
     """Return per cell (H, W) [m] the room beyond a robot's radius, negative where the robot would touch, -inf where a cell is blocked."""
     distance = obstacle_distance(grid, allow_unknown=allow_unknown)
-    return np.where(_blocked(grid, allow_unknown), -np.inf, distance - radius)
+    return np.where(blocked(grid, allow_unknown), -np.inf, distance - radius)
 
 
 def obstacle_distance(grid: Grid, *, allow_unknown: bool) -> np.ndarray:
@@ -103,7 +97,7 @@ def obstacle_distance(grid: Grid, *, allow_unknown: bool) -> np.ndarray:
     """
     import cv2
 
-    is_blocked = _blocked(grid, allow_unknown)
+    is_blocked = blocked(grid, allow_unknown)
     pad = 0 if allow_unknown else 1
     free = np.pad((~is_blocked).astype(np.uint8), pad)
     if free.all():
@@ -113,7 +107,8 @@ def obstacle_distance(grid: Grid, *, allow_unknown: bool) -> np.ndarray:
     return np.maximum(distance.astype(np.float64) - HALF_DIAGONAL, 0.0) * float(grid.resolution)
 
 
-def _blocked(grid: Grid, allow_unknown: bool) -> np.ndarray:
+def blocked(grid: Grid, allow_unknown: bool) -> np.ndarray:
+    """Mark the cells (H, W) that a robot must not touch."""
     return grid.state == 1 if allow_unknown else grid.state != 0
 
 
@@ -123,7 +118,8 @@ def _cell_cost(margin: np.ndarray, clearance: float, weight: float) -> np.ndarra
     return np.where(margin >= 0.0, 1.0 + weight * nearness**2, np.inf)
 
 
-def _cells_of(grid: Grid, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def cells_of(grid: Grid, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the rows and columns (...) of the cells in which places (..., 2) [m, level frame] lie."""
     cell = np.floor((np.asarray(xy) - grid.origin) / float(grid.resolution)).astype(np.int64)
     return cell[..., 1], cell[..., 0]
 
@@ -139,7 +135,7 @@ def end_cell(grid: Grid, margin: np.ndarray, name: str, xy: tuple[float, float],
     if not (np.isfinite(xy).all() and grid.origin[0] <= xy[0] < high[0] and grid.origin[1] <= xy[1] < high[1]):
         extent = f"x {grid.origin[0]:.2f} to {high[0]:.2f} m, y {grid.origin[1]:.2f} to {high[1]:.2f} m"
         raise SlamError(f"{place}: outside the grid, which covers {extent}")
-    row, column = (int(i) for i in _cells_of(grid, np.array(xy)))
+    row, column = (int(i) for i in cells_of(grid, np.array(xy)))
     if margin[row, column] >= 0.0:
         return row, column
     kind = {1: "inside an obstacle", -1: "in unknown space", 0: f"nearer than the robot's radius of {radius:g} m to what is not free"}
@@ -211,7 +207,7 @@ def _a_star(cost, start, goal, before):
     return False
 
 
-def _cheapest(cost: np.ndarray, start: tuple[int, int], goal: tuple[int, int]) -> np.ndarray | None:
+def cheapest(cost: np.ndarray, start: tuple[int, int], goal: tuple[int, int]) -> np.ndarray | None:
     """Return the cells (N, 2) of the cheapest path, None where there is none."""
     columns = cost.shape[1]
     before = np.full(cost.size, -1, dtype=np.int64)

@@ -110,16 +110,21 @@ def clean(run: RunDir) -> dict[str, int]:
     return freed
 
 
-def archive(run: RunDir, out: Path, *, skip: Sequence[str] = ()) -> int:
+def archive(run: RunDir, out: Path, *, skip: Sequence[str] = (), overwrite: bool = False) -> int:
     """Write a run's files to the zip file `out`, all or none; returns how many they are. The same run gives the same bytes.
 
     skip : stages that are left out; what is unpacked knows that they were, as after `clean`
-    Raises Damaged where a file is not what its stage recorded: what is kept for long is worth a look.
+    overwrite : take the place of an archive even where that holds stages which this one would lack
+    Raises Damaged where a file is not what its stage recorded: what is kept for long is worth a look. SlamError where more would be lost.
     """
     if out.resolve().is_relative_to(run.path.resolve()):
         raise SlamError(f"{out}: lies in the run that is to be packed; choose another place")
     _check_intact(run, skip)
     chosen = [path for path in files_of(run) if path.relative_to(run.path).parts[0] not in skip]
+    lost = _stages_in(out) - {path.relative_to(run.path).parts[0] for path in chosen}
+    if lost and not overwrite:
+        there = ", ".join(name for name in NAMES if name in lost)
+        raise SlamError(f"{out}: holds {there}, which the new archive would lack; choose another name, or say --overwrite")
     with files.whole(out) as file, zipfile.ZipFile(file, "w", compression=zipfile.ZIP_DEFLATED) as packed:
         for path in chosen:
             entry = zipfile.ZipInfo(f"{run.path.resolve().name}/{path.relative_to(run.path).as_posix()}", date_time=EARLIEST)
@@ -130,6 +135,16 @@ def archive(run: RunDir, out: Path, *, skip: Sequence[str] = ()) -> int:
             with io.BytesIO(text.encode()) if is_about else path.open("rb") as source, packed.open(entry, "w", force_zip64=True) as target:
                 shutil.copyfileobj(source, target, 1 << 20)
     return len(chosen)
+
+
+def _stages_in(archive: Path) -> set[str]:
+    """List the stages that an archive holds; none where there is no archive."""
+    try:
+        with zipfile.ZipFile(archive) as packed:
+            inside = {parts[1] for name in packed.namelist() if len(parts := name.split("/")) > 2}
+    except (OSError, zipfile.BadZipFile, NotImplementedError):
+        return set()
+    return inside & set(NAMES)
 
 
 def _check_intact(run: RunDir, skip: Sequence[str]) -> None:

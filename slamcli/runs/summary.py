@@ -45,7 +45,10 @@ def _records(run: RunDir) -> dict[str, Any]:
 def _trajectory(records: dict[str, Any]) -> list[str]:
     n_frames, loop = records["extract"]["summary"]["frames"], records["loop"]["summary"]
     apart = loop.get("apart", 0)
-    told = f"{n_frames - loop['lost'] - apart} of {n_frames} frames, {loop['closures']} loop{'s' * (loop['closures'] != 1)} closed"
+    doubtful = f", {loop['doubtful']} doubtful" if loop.get("doubtful") else ""
+    told = (
+        f"{n_frames - loop['lost'] - apart} of {n_frames} frames{doubtful}, {loop['closures']} loop{'s' * (loop['closures'] != 1)} closed"
+    )
     if "recordings" in loop:
         n_joined, n = sum(row["located"] > 0 for row in loop["recordings"]), len(loop["recordings"])
         told = f"{n_joined} of {n} recordings in one frame: {told}"
@@ -59,8 +62,11 @@ def _cost(records: dict[str, Any]) -> list[str]:
     return ["cost", f"{seconds:.1f} s, {n_frames / max(seconds, 1e-3):.1f} frames/s, {peak:.0f} MiB"]
 
 
-def next_commands(run: RunDir) -> list[str]:
-    """List the commands that come next for this run, each to be pasted as it is; none for a robot where no floor is free."""
+def next_commands(run: RunDir, *, is_usable: bool) -> list[str]:
+    """List the commands that come next for this run, each to be pasted as it is; none for a robot where no floor is free.
+
+    is_usable : whether a robot could use the map, by its verdict
+    """
     roots = [entry["root"] for entry in run.recordings] or [run.info()["root"]]
     has_truth = any((Path(root) / "groundtruth.txt").is_file() for root in roots)
     has_floor = (run.record("grid2d") or {"summary": {}})["summary"].get("free", 0) > 0
@@ -68,5 +74,6 @@ def next_commands(run: RunDir) -> list[str]:
     return [
         *([f"slamcli eval ape {which}"] if has_truth else []),
         f"slamcli report {which}",
-        *([f"slamcli export-grid map.pgm --png map.png {which}", f"slamcli plan --start first --goal last {which}"] if has_floor else []),
+        *([f"slamcli export-grid map.pgm --png map.png {which}"] if has_floor else []),
+        *([f"slamcli plan --start first --reachable {which}"] if has_floor and is_usable else []),
     ]

@@ -48,7 +48,11 @@ def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
     artifacts.save(stands_still, out)
     lost = lost_spans(tracks.state, tracker.lost_reason)
     for first, last, reason in lost:
-        tools.warn(f"frames {first} to {last} are lost: {reason}" if last > first else f"frame {first} is lost: {reason}")
+        since = features.stamp[[first, last]] - features.stamp[0]
+        spell = (
+            f"frames {first} to {last} ({since[0]:.1f} to {since[1]:.1f} s) are" if last > first else f"frame {first} ({since[0]:.1f} s) is"
+        )
+        tools.warn(f"{spell} lost: {reason}")
     save_map(out, inputs.load(FrameTimes, "extract"), tracks, map_)
     return {
         "frames": len(features.stamp),

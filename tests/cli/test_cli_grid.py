@@ -324,6 +324,16 @@ def test_plan_tells_what_a_robot_can_reach(slamcli, run, tmp_path):
     assert slamcli("plan", "--start", "0,0", "-r", run).exit_code == 2
 
 
+def test_a_goal_does_not_move_the_place_where_the_recording_began(slamcli, run, tmp_path):
+    """Else a path that begins beyond a barrier would pass for one from here."""
+    folder = RunDir(run)
+    alone = json.loads(slamcli("plan", "--reachable", "--start", "first", "-r", run, "--json").stdout)["start"]
+    path = json.loads(slamcli("plan", "--start", "first", "--goal", "0,1", "-r", run, "--json").stdout)
+    assert path["start"] == alone and list(path["moved"]) == ["start"]
+    camera = placement.camera_path(folder)[0, :2]
+    assert path["moved"]["start"] == pytest.approx(float(np.hypot(*(camera - alone))), abs=1e-3)
+
+
 def test_where_no_way_leads_the_picture_shows_what_is_within_reach(slamcli, run, tmp_path):
     folder = RunDir(run)
     grid = folder.load(Grid, "grid2d")

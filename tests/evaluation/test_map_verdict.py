@@ -214,8 +214,8 @@ def test_the_end_of_a_run_tells_start_frames_and_verdict(slamcli, room_run, here
     T_lw = RunDir.find("room").load(Ground, "densify").T_lw
     line = next(line for line in told if line.startswith("T_lw"))
     np.testing.assert_allclose([float(word) for word in line.split()[1:4]], T_lw[:3, 3], atol=1e-4)
-    amber = told.index("amber       floor seen in 0 of 40 views")
-    assert told[amber + 1].strip() == "-> tilt the camera down until the floor 1 to 2 m ahead is in the picture"
+    problem = told.index("problem     floor seen in 0 of 40 views")
+    assert told[problem + 1].strip() == "-> tilt the camera down until the floor 1 to 2 m ahead is in the picture"
     made = json.loads(slamcli("run", "-r", "room", "--json").stdout)
     has_floor = bool((RunDir.find("room").load(Grid, "grid2d").state == 0).any())
     assert any("slamcli plan" in line for line in made["next"]) == has_floor  # no hint that can only fail

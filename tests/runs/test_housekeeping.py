@@ -170,6 +170,26 @@ def test_an_archive_unpacked_elsewhere_is_a_run_again(made, slamcli, here) -> No
     assert "cleaned" not in RunDir.find("mine").info()
 
 
+def test_an_archive_of_more_is_not_overwritten_without_a_word(made, slamcli, here) -> None:
+    assert slamcli("archive", "a.zip", "-r", "mine").exit_code == 0
+    whole = (here / "a.zip").read_bytes()
+    assert slamcli("archive", "a.zip", "-r", "mine").exit_code == 0  # as much as before
+    housekeeping.clean(RunDir.find("mine"))
+    result = slamcli("archive", "a.zip", "-r", "mine")
+    assert result.exit_code == 1 and "a.zip: holds extract, match, track, optimize, which" in result.stderr
+    assert (here / "a.zip").read_bytes() == whole
+    assert slamcli("archive", "a.zip", "-r", "mine", "--overwrite").exit_code == 0
+    assert len((here / "a.zip").read_bytes()) < len(whole)
+
+
+def test_nothing_is_deleted_from_a_run_that_was_not_named(made, slamcli, here, monkeypatch) -> None:
+    (here / "runs" / "latest").symlink_to("mine")
+    result = slamcli("clean", "--keep", "results")
+    assert result.exit_code == 2 and "-r runs/mine" in result.stderr and (made / "extract").is_dir()
+    monkeypatch.setenv("SLAMCLI_RUN", str(made))
+    assert slamcli("clean", "--keep", "results").exit_code == 0 and not (made / "extract").exists()
+
+
 @pytest.mark.parametrize(
     ("out", "says"), [("a.tar", "must end in .zip"), ("runs/mine/a.zip", "lies in the run"), ("no/a.zip", "cannot be written")]
 )

@@ -149,7 +149,7 @@ def test_zero_never_begins_a_segment(tmp_path):
     run.stage(track)
     tracks, _ = run.result("track")
     assert (tracks.state[:30] != LOST).all() and (tracks.state[30:] == LOST).all()
-    assert "frames 30 to 59 are lost: fewer than 15" in run.warnings[0]
+    assert "frames 30 to 59 (1.0 to 2.0 s) are lost: fewer than 15" in run.warnings[0]
 
 
 def two_segments(rng) -> tuple[SparseMap, np.ndarray, np.ndarray]:
