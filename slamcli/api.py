@@ -40,6 +40,8 @@ if TYPE_CHECKING:
     from slamcli.schema import Grid, Ground, Trajectory
     from slamcli.slam.doubt import Finding
 
+    Look = Callable[[Dataset], Sequence[Finding] | None]
+
 __all__ = ["Run", "open_run", "run"]
 
 log = logging.getLogger(__name__)
@@ -60,7 +62,7 @@ def run(
     force: bool = False,
     progress: Progress = silent,
     tell: Tell = log.info,
-    look: "Callable[[Dataset], Sequence[Finding]] | None" = None,
+    look: "Look | None" = None,
 ) -> "Run":
     """Make a run of a recording, or bring the one that is there up to date: exactly the stages that need it.
 
@@ -71,7 +73,8 @@ def run(
     data : folder of recordings to look in first
     start, until, force : run from this stage on whether up to date or not; stop after this one; run every stage
     progress : passes items through under a bar, as ``progress(items, label, total=None)``; tell : takes single lines
-    look : is given the recording before its first stage runs, to say what is wrong with it; what it returns the run keeps
+    look : is given each recording before its first stage runs. It returns findings that the run keeps, or None; an error it raises
+        ends the call before anything is computed
 
     Raises SlamError for whatever the caller can mend, such as a recording that is not there or an option that is not known.
     """
@@ -82,7 +85,7 @@ def run(
     opened, dataset, resolved = reopen(resolve=resolve)
     found: dict[str, Sequence[Finding]] = {}
     if look is not None and (force or start == NAMES[0] or not pipeline(opened, resolved, dataset=dataset).states()[NAMES[0]].is_fresh):
-        found = {str(one.root.resolve()): look(one) for one in getattr(dataset, "parts", [dataset])}
+        found = {str(one.root.resolve()): look(one) or () for one in getattr(dataset, "parts", [dataset])}
         said = [finding.name for findings in found.values() for finding in findings]
         if resolved.recording.find_depth_camera and len(targets) == 1 and "registration" in said:
             ((root, findings),) = found.items()
@@ -155,7 +158,7 @@ class Run:
         data: str | None = None,
         progress: Progress = silent,
         tell: Tell = log.info,
-        look: "Callable[[Dataset], Sequence[Finding]] | None" = None,
+        look: "Look | None" = None,
     ) -> "Run":
         """Add recordings to the map, and bring the run up to date; none that is in it already is tracked again.
 
@@ -164,7 +167,7 @@ class Run:
         self.directory.restore()
         config = self.config()
         datasets = [open_target(str(target), config, data, progress) for target in targets]
-        looked = {str(dataset.root.resolve()): look(dataset) for dataset in datasets} if look is not None else {}
+        looked = {str(dataset.root.resolve()): look(dataset) or () for dataset in datasets} if look is not None else {}
         with writing(self.directory, config):
             self.directory.mark_latest()
             extend(self.directory, datasets)

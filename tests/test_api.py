@@ -14,6 +14,7 @@ from slamcli.errors import SlamError
 from slamcli.formats.trajectory import read_tum
 from slamcli.geometry import se3
 from slamcli.schema import Trajectory
+from slamcli.slam.doubt import Finding
 from slamcli.stages import NAMES
 
 
@@ -133,3 +134,21 @@ def test_names_of_the_package(room_run: Path) -> None:
     with pytest.raises(AttributeError, match="no attribute 'walk'"):
         _ = slamcli.walk
     assert repr(slamcli.open_run(room_run)) == f"Run({str(room_run)!r})"
+
+
+def test_a_look_may_find_nothing_or_refuse_a_recording(room: Path, here: Path) -> None:
+    seen = []
+    first = slamcli.run(room, path="run", until="extract", look=lambda dataset: seen.append(dataset.root))
+    assert seen == [room.resolve()] and "doubts" not in first.summary()["extract"]
+
+    def refuse(dataset):
+        raise SlamError(f"{dataset.root}: not this one")
+
+    with pytest.raises(SlamError, match="not this one"):
+        slamcli.run(room, path="other", look=refuse)
+    assert slamcli.open_run("other").summary() == {}
+
+
+def test_what_a_look_finds_stays_with_the_run(room: Path, here: Path) -> None:
+    run = slamcli.run(room, path="run", until="extract", look=lambda dataset: [Finding("lamp", "the lamp is off")])
+    assert [row["name"] for row in run.summary()["extract"]["doubts"]] == ["lamp"]
