@@ -113,7 +113,7 @@ def _start(folder: RunDir, mount: tuple[float, ...] | None) -> tuple[float, floa
     """
     import numpy as np
 
-    from slamcli.navigation.robot_pose import base_in_camera, base_off_floor, base_pose
+    from slamcli.navigation.robot_pose import base_in_camera, base_off_floor, base_pose, upright_mount
     from slamcli.runs import placement
     from slamcli.schema import Ground
 
@@ -128,10 +128,11 @@ def _start(folder: RunDir, mount: tuple[float, ...] | None) -> tuple[float, floa
     ground = folder.load(Ground, "densify")
     T_lc, T_cb = ground.T_lw @ placement.camera_poses(folder)[0], base_in_camera(mount)
     height, tilt = base_off_floor(T_lc, T_cb)
+    upright = ",".join(f"{value + 0.0:.3g}" for value in np.round(upright_mount(T_lc, mount), 3))
     if ground.is_found and (abs(height) > MOUNT_HEIGHT or tilt > MOUNT_TILT):
         click.echo(
             f"Warning: with this mount the robot's base is {height:.2f} m above the floor and tilted by {np.degrees(tilt):.0f} degrees, as the "
-            f"camera was at {T_lc[2, 3]:.2f} m; check z, roll and pitch [m, rad]",
+            f"camera was at {T_lc[2, 3]:.2f} m; it stands upright on the floor with --mount {upright}",
             err=True,
         )
     return base_pose(T_lc, T_cb)

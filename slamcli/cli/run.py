@@ -179,8 +179,15 @@ def _stage_command(stage: Stage) -> click.Command:
     @set_option
     def command(run: str | None, config_name: str | None, assignments: tuple[str, ...]) -> None:
         from slamcli import api, console
+        from slamcli.runs import staleness
 
-        api.open_run(run).run_stage(stage.name, settings=assignments, config=config_name, progress=console.progress, tell=console.say)
+        done = api.open_run(run).run_stage(
+            stage.name, settings=assignments, config=config_name, progress=console.progress, tell=console.say
+        )
+        made = ((name, state) for name, state in done.status().items() if state.state != staleness.MISSING)
+        behind = [name for name, state in made if not state.is_fresh and not done.directory.is_cleaned(state)]
+        if behind:
+            console.say(f"not up to date now: {', '.join(behind)}; make them anew with: slamcli run {done.directory.flag}")
 
     return command
 

@@ -36,6 +36,15 @@ def base_in_camera(mount: Sequence[float]) -> np.ndarray:
     return se3.inverse(product(T_b_body, OPTICAL_IN_BODY))
 
 
+def upright_mount(T_lc: np.ndarray, mount: Sequence[float]) -> tuple[float, ...]:
+    """Correct a mount's z, roll and pitch so that the base stands upright on the floor where the camera is at T_lc (4, 4)."""
+    R_l_body = product(T_lc, se3.inverse(OPTICAL_IN_BODY))[:3, :3]
+    roll = elementary.arctan2(R_l_body[2, 1], R_l_body[2, 2])
+    pitch = elementary.arctan2(-R_l_body[2, 0], np.sqrt(R_l_body[2, 1] ** 2 + R_l_body[2, 2] ** 2))
+    x, y, _, _, _, yaw = mount
+    return x, y, float(T_lc[2, 3]), float(roll), float(pitch), yaw
+
+
 def base_pose(T_lc: np.ndarray, T_cb: np.ndarray) -> tuple[float, float, float]:
     """Return x [m], y [m] and heading [rad] on the floor of a robot's base, T_cb (4, 4) base to camera."""
     T_lb = product(T_lc, T_cb)

@@ -252,7 +252,9 @@ def test_a_stage_command_edits_the_settings_and_runs_only_that_stage(fake: Path,
     slamcli("run", "recordings/desk")
     result = slamcli("track", "-s", "track.min_inliers=20")
     assert result.exit_code == 0
-    assert [line.split()[0] for line in result.stderr.splitlines()] == ["track"]
+    assert [line.split()[0] for line in result.stderr.splitlines()] == ["track", "not"]
+    behind = ", ".join(NAMES[NAMES.index("track") + 1 :])
+    assert result.stderr.endswith(f"not up to date now: {behind}; make them anew with: slamcli run -r runs/desk\n")
     after = states(slamcli)
     assert [name for name in NAMES if after[name] == "up to date"] == ["extract", "match", "track"]
     assert slamcli("grid2d").stderr.startswith(

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from slamcli.navigation.floor import level_frame
-from slamcli.navigation.robot_pose import base_in_camera, base_pose, planar_pose
+from slamcli.navigation.robot_pose import base_in_camera, base_off_floor, base_pose, planar_pose, upright_mount
 
 ANGLE = st.floats(-3.0, 3.0)
 
@@ -43,3 +43,11 @@ def test_the_base_is_found_from_its_camera(mount: tuple, yaw: float, x: float, y
     T_lb = np.array([[np.cos(yaw), -np.sin(yaw), 0, x], [np.sin(yaw), np.cos(yaw), 0, y], [0, 0, 1, 0], [0, 0, 0, 1]])
     T_cb = base_in_camera(mount)
     assert base_pose(T_lb @ np.linalg.inv(T_cb), T_cb) == pytest.approx((x, y, yaw), abs=1e-9)
+
+
+@given(ANGLE, st.floats(-1.2, 1.2), st.floats(-0.5, 0.5), st.tuples(*[st.floats(-1, 1)] * 5, ANGLE))
+def test_a_corrected_mount_puts_the_base_upright_on_the_floor(yaw: float, pitch: float, roll: float, mount: tuple) -> None:
+    T_lc = look_along([2.0, -1.0, 0.7], yaw, pitch, roll)
+    upright = upright_mount(T_lc, mount)
+    assert base_off_floor(T_lc, base_in_camera(upright)) == pytest.approx((0.0, 0.0), abs=1e-7)
+    assert (upright[0], upright[1], upright[5]) == (mount[0], mount[1], mount[5])
