@@ -102,18 +102,20 @@ def widest_gap(grid: Grid, start: tuple[float, float], beyond: np.ndarray, *, ra
     row, column = (int(i) for i in planner.cells_of(grid, np.array(start)))
     widths = np.unique(distance[(distance >= 0.0) & (distance <= radius)])
 
-    def goals(least: float) -> np.ndarray:
+    def within(least: float) -> np.ndarray:
         labels, _ = ndimage.label(distance >= least, structure=planner.CROSS)
-        return np.argwhere((labels == labels[row, column]) & beyond) if labels[row, column] else np.empty((0, 2), np.int64)
+        return (labels == labels[row, column]) & (labels > 0)
 
-    n_wide_enough = bisect.bisect_left(widths, True, key=lambda least: len(goals(least)) == 0)
+    n_wide_enough = bisect.bisect_left(widths, True, key=lambda least: not (within(least) & beyond).any())
     if n_wide_enough == 0:
         return None
-    least = widths[n_wide_enough - 1]
-    way = planner.cheapest(np.where(distance >= least, 1.0, np.inf), (row, column), tuple(goals(least)[0]))
+    least, wider = np.append(widths, np.inf)[n_wide_enough - 1 : n_wide_enough + 1]
+    goal = tuple(np.argwhere(within(least) & beyond)[0])
+    way = planner.cheapest(np.where(distance >= least, 1.0, np.inf), (row, column), goal)
     if way is None:
         return None
-    narrow = way[np.argmin(distance[tuple(way.T)])]
+    # Where the way last leaves what a wider robot gets to: it may pass obstacles as closely before, without need.
+    narrow = way[min(np.flatnonzero(within(wider)[tuple(way.T)]).max(initial=0) + 1, len(way) - 1)]
     around = np.argwhere(planner.blocked(grid, allow_unknown))
     nearest = around[np.argmin(np.sum((around - narrow) ** 2, axis=1))] if len(around) else narrow
     xy = (narrow[::-1] + 0.5) * float(grid.resolution) + grid.origin

@@ -39,6 +39,14 @@ def test_of_two_doors_the_wider_one_counts() -> None:
     assert 3.0 < gap.xy[0] < 3.45
 
 
+def test_an_obstacle_that_the_way_passes_as_closely_is_not_taken_for_the_gap() -> None:
+    grid = two_rooms((66, 72))
+    state = np.array(grid.state)
+    state[22:26, 24:60] = 1  # between the start and the door: the shortest way cuts its corners
+    gap = gap_of(Grid(grid.p_occupied, grid.n_seen, state, grid.origin, grid.resolution))
+    assert np.hypot(gap.xy[0] - 69 * RESOLUTION, gap.xy[1] - 2.525) < 2 * RESOLUTION
+
+
 def test_a_robot_of_that_width_gets_through() -> None:
     grid = two_rooms((30, 40))
     gap = gap_of(grid)
