@@ -116,10 +116,10 @@ def plan(
     except planner.NoWay as error:
         if png is None:
             raise
-        _draw_reach(png, grid, [start, goal], radius, allow_unknown, trajectory)
-        raise SlamError(
-            f"{error}; {png} shows what can be reached from the start{_gap_before(grid, start, goal, radius, allow_unknown)}"
-        ) from error
+        gap = _gap_before(grid, start, goal, radius, allow_unknown)
+        _draw_reach(png, grid, [start, goal], gap, radius, allow_unknown, trajectory)
+        leads = "" if gap is None else f"; the way leads through {_told(gap)}"
+        raise SlamError(f"{error}; {png} shows what can be reached from the start{leads}") from error
     texts = {".csv": _csv(route), ".json": _json(route, start, goal, radius, moved)}
     if out is not None:
         _write(out, texts)
@@ -191,7 +191,12 @@ def _tell_reachable(
 
     found = reach(grid, start, radius=radius, allow_unknown=allow_unknown, walls=walls)
     if png is not None:
-        save_picture(png, grid, Overlay(reached=found.cells, ends=[start]), title=f"white: within reach of a robot of {radius:g} m radius")
+        save_picture(
+            png,
+            grid,
+            Overlay(reached=found.cells, ends=[start], gap=None if found.gap is None else found.gap.xy),
+            title=f"white: within reach of a robot of {radius:g} m radius",
+        )
     if as_json:
         click.echo(json.dumps({"start": _rounded(start), "radius": radius, **found.to_dict()}))
         return
@@ -215,7 +220,7 @@ def _told(gap: Gap) -> str:
     return f"a gap of {gap.width:.2f} m at {x:.2f},{y:.2f}, beside an obstacle"
 
 
-def _gap_before(grid: Grid, start: tuple[float, float], goal: tuple[float, float], radius: float, allow_unknown: bool) -> str:
+def _gap_before(grid: Grid, start: tuple[float, float], goal: tuple[float, float], radius: float, allow_unknown: bool) -> Gap | None:
     import numpy as np
 
     from slamcli.navigation import planner
@@ -224,12 +229,17 @@ def _gap_before(grid: Grid, start: tuple[float, float], goal: tuple[float, float
     there = np.zeros(grid.state.shape, dtype=np.bool_)
     row, column = planner.cells_of(grid, np.array(goal))
     there[row, column] = True
-    gap = widest_gap(grid, start, there, radius=radius, allow_unknown=allow_unknown)
-    return "" if gap is None else f"; the way leads through {_told(gap)}"
+    return widest_gap(grid, start, there, radius=radius, allow_unknown=allow_unknown)
 
 
 def _draw_reach(
-    png: Path, grid: Grid, ends: list[tuple[float, float]], radius: float, allow_unknown: bool, trajectory: np.ndarray | None
+    png: Path,
+    grid: Grid,
+    ends: list[tuple[float, float]],
+    gap: Gap | None,
+    radius: float,
+    allow_unknown: bool,
+    trajectory: np.ndarray | None,
 ) -> None:
     """Draw what a robot can cover from the first of two places between which there is no way."""
     from slamcli.navigation import cost_layers
@@ -238,7 +248,7 @@ def _draw_reach(
     centres = cost_layers.reachable(grid, ends[0], radius=radius, allow_unknown=allow_unknown)
     reached = cost_layers.swept(grid, centres, radius=radius)
     title = f"no way for a robot of {radius:g} m radius; white: within reach"
-    save_picture(png, grid, Overlay(trajectory, reached=reached, ends=ends), title=title)
+    save_picture(png, grid, Overlay(trajectory, reached=reached, ends=ends, gap=None if gap is None else gap.xy), title=title)
 
 
 def _ends(

@@ -27,6 +27,7 @@ class Overlay:
     radius: float = 0.0  # [m] of the robot that it is planned for, and drawn as wide as
     reached: np.ndarray | None = None  # (H, W) bool, cells that a robot can cover; free floor beyond them gets a colour of its own
     ends: Sequence[Sequence[float]] = ()  # x, y [m] of the start, and of a goal, where no route joins them
+    gap: tuple[float, float] | None = None  # x, y [m] where a way is too narrow, drawn as a ring
     began: tuple[float, float, float] | None = None  # x [m], y [m], yaw [rad] where the recording began, drawn as an arrow
 
 
@@ -68,6 +69,9 @@ def draw(axis: Any, grid: Grid, over: Overlay, *, title: str = "", font: float =
     if over.route is not None and len(over.route):
         handles += _draw_route(axis, over.route, over.radius)
     handles += _draw_ends(axis, over.ends)
+    if over.gap is not None:
+        ring = {"marker": "o", "ms": 16, "mfc": "none", "mec": ROUTE, "mew": 2.5}
+        handles += axis.plot(*over.gap, ls="none", label="too narrow", **ring)
     if over.began is not None:
         handles += _draw_began(axis, over.began, extent)
     axis.set_xlim(extent[:2])
