@@ -44,7 +44,7 @@ from slamcli.runs import damage, housekeeping, summary
 from slamcli.runs.run_directory import RunDir
 from slamcli.schema import Closures, Grid, Trajectory
 from slamcli.slam import doubt
-from slamcli.stages import NAMES
+from slamcli.stages import NAMES, stage_named
 from slamcli.vision import vocabulary
 
 SECONDS = 5.0  # of CPU that one input may take,
@@ -354,9 +354,9 @@ def forged(path: Path) -> None:
     run.states(run.config())
     records = {stage: run.record(stage) for stage in NAMES}
     doubt.verdict(doubt.from_records(records))
-    for record in records.values():
+    for name, record in records.items():
         if record is not None:
-            stage_line(record)
+            stage_line(record, stage_named(name).told)
     summary.outcome(run)
     housekeeping.list_runs(run.path.parent)
 

@@ -25,7 +25,7 @@ from slamcli.evaluation import trajectory_error
 from slamcli.geometry import se3
 from slamcli.runs.run_directory import RunDir
 from slamcli.schema import Closures, Features, Map
-from slamcli.stages import NAMES
+from slamcli.stages import NAMES, WITH_TRAJECTORY
 
 FALSE_M, FALSE_DEG = 0.2, 5.0  # a closure that is off by more claims the wrong place
 REVISIT = 0.6  # laps that lie between two visits at least
@@ -64,7 +64,7 @@ class Figures:
     def row(self) -> list[str]:
         """Make a line of the table."""
         counts = (self.n_frames, self.lost, self.segments, self.closures, self.revisits, self.false)
-        errors = (f"{self.ape[stage]:.4f}" for stage in trajectory_error.STAGES)
+        errors = (f"{self.ape[stage]:.4f}" for stage in WITH_TRAJECTORY)
         rival = "" if self.rival is None else f"{self.rival:.4f}"
         return [self.name, *map(str, counts), *errors, f"{100 * self.loop_share:.1f} %", rival]
 
@@ -100,7 +100,7 @@ def one(folder: Path, name: str, settings: dict[str, Any], laps: float, rival: l
     run = slamcli.run(recording, path=path, progress=console.progress, tell=console.say).directory
     truth, n_frames = trajectory_error.ground_truth(run), len(run.load(Features, "extract").stamp)
     ape = {}
-    for stage in trajectory_error.STAGES:
+    for stage in WITH_TRAJECTORY:
         error = trajectory_error.ape(trajectory_error.stage_trajectory(run, stage), truth, n_frames=n_frames, name=stage).error
         ape[stage] = trajectory_error.statistics(error)["rmse"]
     frames, is_true = closures(run)

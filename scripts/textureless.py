@@ -20,6 +20,7 @@ from slamcli.datasets.simulate import simulate
 from slamcli.evaluation import trajectory_error
 from slamcli.runs.run_directory import RunDir
 from slamcli.schema import Features
+from slamcli.stages import WITH_TRAJECTORY
 
 ROOMS: dict[str, dict[str, Any]] = {"dark": {"dark": True}, "plain": {"textured": 0.0}, "mixed": {"textured": 0.3}}
 HEADINGS = ["room", "frames", "with a pose", "on shape", "track [m]", "optimize [m]", "loop [m]", "track CPU [ms/frame]", "ORB-SLAM3 [m]"]
@@ -52,8 +53,7 @@ def one(folder: Path, settings: dict[str, Any], rival: list[str] | None) -> list
     run = slamcli.run(recording, path=path, until="loop", progress=console.progress, tell=console.say).directory
     truth, n_frames = trajectory_error.ground_truth(run), len(run.load(Features, "extract").stamp)
     errors = [
-        trajectory_error.ape(trajectory_error.stage_trajectory(run, s), truth, n_frames=n_frames, name=s).error
-        for s in trajectory_error.STAGES
+        trajectory_error.ape(trajectory_error.stage_trajectory(run, s), truth, n_frames=n_frames, name=s).error for s in WITH_TRAJECTORY
     ]
     track = run.record("track")
     cpu = 1e3 * (track["cpu_seconds"] - track["compile_seconds"]) / n_frames

@@ -20,17 +20,6 @@ Progress = Callable[..., Iterable[Any]]  # (items, label, total=None) -> the sam
 Tell = Callable[[str], Any]  # takes a line
 ROOT = logging.getLogger("slamcli")
 AMBER, PLAIN = "\x1b[33m", "\x1b[0m"
-# Counts that a finished stage is told by, the rest with -v; docs/glossary.md says what they mean.
-TOLD = {
-    "extract": ("features", "frames_without_depth", "bad_images"),
-    "match": ("matches_per_pair",),
-    "track": ("key_frames", "landmarks", "lost"),
-    "optimize": ("outliers",),
-    "loop": ("candidates", "closures", "lost"),
-    "densify": ("points",),
-    "octree": ("occupied_cells", "free_cells"),
-    "grid2d": ("occupied", "free"),
-}
 
 
 class _Voice:
@@ -134,8 +123,8 @@ def table(rows: Sequence[Sequence[str]], *, right: Iterable[int] = ()) -> str:
     return "\n".join(lines)
 
 
-def stage_line(record: Mapping[str, Any]) -> str:
-    """Tell one finished stage in a line: frames, time, rate, and counts of its summary; all of these under -v."""
+def stage_line(record: Mapping[str, Any], told: Sequence[str]) -> str:
+    """Tell one finished stage in a line: frames, time, rate, and those counts of its summary that are `told`; all of them under -v."""
     summary = record["summary"]
     parts = [f"{record['stage']:<9}"]
     if "frames" in summary:
@@ -145,7 +134,7 @@ def stage_line(record: Mapping[str, Any]) -> str:
         parts.append(f"{record['fps']:.1f} fps")
     if record["compile_seconds"] >= 0.5:
         parts.append(f"({record['compile_seconds']:.1f} s of it compiling kernels, this once)")
-    parts += counts(summary, None if _Voice.verbosity else TOLD.get(record["stage"]))
+    parts += counts(summary, None if _Voice.verbosity else told)
     if record["n_warnings"]:
         parts.append(f"{record['n_warnings']} warnings")
     return "  ".join(parts)

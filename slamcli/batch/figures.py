@@ -10,10 +10,10 @@ from slamcli import __version__
 from slamcli.batch import storage
 from slamcli.datasets import Dataset
 from slamcli.errors import SlamError
-from slamcli.evaluation import run_content, trajectory_error
+from slamcli.evaluation import run_content
 from slamcli.report import doubts
 from slamcli.runs.run_directory import RunDir
-from slamcli.stages import NAMES
+from slamcli.stages import NAMES, WITH_TRAJECTORY
 
 Row = Mapping[str, Any]
 
@@ -56,7 +56,7 @@ def of_run(run: RunDir, dataset: Dataset | None = None) -> dict[str, Any]:
     }
     for record in records:
         found |= {name: record["summary"][name] for name in ("frames", "closures") if name in record["summary"]}
-    return found | (_judged(run, dataset) if any(record["stage"] in trajectory_error.STAGES for record in records) else {})
+    return found | (_judged(run, dataset) if any(record["stage"] in WITH_TRAJECTORY for record in records) else {})
 
 
 def _judged(run: RunDir, dataset: Dataset | None) -> dict[str, Any]:

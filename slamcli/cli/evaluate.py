@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 from slamcli.cli.common import Target, complete_run, json_option, run_option
+from slamcli.stages import WITH_TRAJECTORY
 
 if TYPE_CHECKING:
     import numpy as np
@@ -64,7 +65,7 @@ def _trajectory_options(function: Any) -> Any:
         run_option,
         click.option(
             "--stage",
-            type=click.Choice(["track", "optimize", "loop", "all"]),
+            type=click.Choice([*WITH_TRAJECTORY, "all"]),
             help="The stage whose trajectory is measured. [default: the last that has been run]",
         ),
         click.option(
@@ -219,7 +220,7 @@ def _trajectories(folder: RunDir, stage: str | None, other: tuple[str, ...]) -> 
     from slamcli.formats.trajectory import read_tum
 
     last = trajectory_error.last_stage(folder)
-    stages = trajectory_error.STAGES[: trajectory_error.STAGES.index(last) + 1] if stage == "all" else (stage or last,)
+    stages = WITH_TRAJECTORY[: WITH_TRAJECTORY.index(last) + 1] if stage == "all" else (stage or last,)
     found = [(_label(folder), which, trajectory_error.stage_trajectory(folder, which)) for which in stages]
     for item in _of_one_recording(folder, other, "--other"):
         name, equals, file = item.partition("=")

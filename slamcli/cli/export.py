@@ -10,6 +10,7 @@ import click
 
 from slamcli.cli.common import Target, check_ending, frame_option, json_option, mount_option, run_option, tell_written, told_in
 from slamcli.formats import TRAJECTORY_FORMATS
+from slamcli.stages import WITH_TRAJECTORY
 
 if TYPE_CHECKING:
     import numpy as np
@@ -26,7 +27,7 @@ LAYOUT_OF = {ending: layout for layout, endings in TRAJECTORY_FORMATS.items() fo
 @run_option
 @click.option(
     "--stage",
-    type=click.Choice(["track", "optimize", "loop"]),
+    type=click.Choice(WITH_TRAJECTORY),
     help="The stage whose trajectory is written; default: the last that has been run.",
 )
 @frame_option

@@ -16,6 +16,7 @@ from slamcli.runs import placement
 from slamcli.runs.run_directory import RunDir
 from slamcli.runs.staleness import State
 from slamcli.schema import LOST, Closures, Doubt, Features, FrameTimes, Ground, Map, Tracks, Trajectory
+from slamcli.stages import WITH_TRAJECTORY
 
 UPRIGHT = np.array(
     [[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
@@ -146,7 +147,7 @@ def _ape(run: RunDir, stamp: np.ndarray, truth: Trajectory | None) -> dict[str, 
     found: dict[str, Ape] = {}
     if truth is None:
         return found
-    for stage in trajectory_error.STAGES:
+    for stage in WITH_TRAJECTORY:
         if run.record(stage) is not None:
             try:
                 found[stage] = trajectory_error.ape(

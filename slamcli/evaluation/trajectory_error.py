@@ -17,8 +17,8 @@ from slamcli.datasets.association import MAX_DIFFERENCE, associate
 from slamcli.errors import SlamError
 from slamcli.geometry import se3
 from slamcli.schema import Doubt, FrameTimes, Map, Tracks, Trajectory, trajectory
+from slamcli.stages import WITH_TRAJECTORY
 
-STAGES = ("track", "optimize", "loop")  # in the order they refine the trajectory
 RPE_SECONDS = 1.0  # [s] interval over which drift is measured
 RPE_TOLERANCE = 0.1  # share of that interval by which a pair may miss it, as in evo
 
@@ -111,7 +111,7 @@ def statistics(error: np.ndarray) -> dict[str, float]:
 
 def last_stage(run: Any) -> str:
     """Name the last stage of a run that holds a trajectory."""
-    for stage in reversed(STAGES):
+    for stage in reversed(WITH_TRAJECTORY):
         if run.record(stage) is not None:
             return stage
     raise SlamError(f"{run.path}: no stage has made a trajectory yet; try: slamcli run --until track {run.flag}")
@@ -140,7 +140,7 @@ def sure_figures(run: Any, found: Ape) -> dict[str, Any]:
 
 def frame_count(run: Any) -> int:
     """Count the colour frames of a run's recording, as any of its stages knows them."""
-    records = (run.record(stage) for stage in ("extract", *reversed(STAGES)))
+    records = (run.record(stage) for stage in ("extract", *reversed(WITH_TRAJECTORY)))
     return next(int(record["summary"]["frames"]) for record in records if record is not None)
 
 

@@ -12,10 +12,9 @@ from slamcli import files
 from slamcli.errors import Damaged, SlamError
 from slamcli.runs.places import LATEST, RECORDINGS, RUNS
 from slamcli.runs.run_directory import RunDir
-from slamcli.stages import NAMES
+from slamcli.stages import INTERMEDIATE, NAMES
 
 DEEPEST = 3  # folders below runs/ in which runs are looked for: runs/tum/fr1_room is the deepest that slamcli makes by itself
-INTERMEDIATE = ("extract", "match", "track", "optimize")  # what only later stages read; the results are in the stages after them
 NO_RESULTS = (*INTERMEDIATE, RECORDINGS)  # folders that hold none, with those of single recordings in a run of several
 EARLIEST = (1980, 1, 1, 0, 0, 0)  # of a zip file: no clock in it, so that the same run gives the same bytes
 

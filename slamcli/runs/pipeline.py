@@ -262,7 +262,7 @@ class Pipeline:
             record = self._record(stage, inputs, damage.outputs(out), meter, tools, summary)
             self.run.commit(stage.name, out, record)
         log.debug("%s", record)
-        self._tell(stage_line(record))
+        self._tell(stage_line(record, stage.told))
         return_free_memory(meter.taken_mb)
 
     def _present_input(self, name: str) -> str:

@@ -18,6 +18,7 @@ from slamcli.evaluation import trajectory_error
 from slamcli.formats.trajectory import read_tum, write_tum
 from slamcli.runs.run_directory import RunDir
 from slamcli.schema import Ground, Trajectory
+from slamcli.stages import WITH_TRAJECTORY
 
 Command = Callable[..., Result]
 
@@ -41,7 +42,7 @@ def test_ape_as_json(slamcli: Command, made: finished.Finished) -> None:
 
 def test_ape_of_each_stage_is_that_of_its_trajectory_file(slamcli: Command, made: finished.Finished) -> None:
     rmse = {}
-    for stage in trajectory_error.STAGES:
+    for stage in WITH_TRAJECTORY:
         figures = json.loads(slamcli("eval", "ape", "-r", made.run, "--stage", stage, "--json").stdout)
         file = trajectory_error.ape(read_tum(made.run / stage / "trajectory.txt"), made.truth, n_frames=90, name="file")
         assert figures["rmse"] == pytest.approx(file.to_dict()["rmse"], abs=1e-9)

@@ -15,10 +15,10 @@ from slamcli.runs import housekeeping
 from slamcli.runs.run_directory import RunDir
 from slamcli.runs.staleness import MISSING
 from slamcli.schema import Grid
-from slamcli.stages import NAMES
+from slamcli.stages import INTERMEDIATE, NAMES
 
 MADE = NAMES[: NAMES.index("densify") + 1]
-RESULTS = set(MADE) - set(housekeeping.INTERMEDIATE)
+RESULTS = set(MADE) - set(INTERMEDIATE)
 NOTHING_SEEN = Grid(
     p_occupied=np.full((4, 4), np.nan, np.float32), n_seen=np.zeros((4, 4), np.int32), state=np.full((4, 4), -1, np.int8),
     origin=np.zeros(2), resolution=np.array(0.05),
@@ -60,14 +60,14 @@ def test_a_damaged_run_is_listed_as_that(made, slamcli, name: str) -> None:
 
 
 def test_clean_keeps_the_results_and_says_what_it_freed(made, slamcli, tmp_path) -> None:
-    before = {path: path.stat().st_size for stage in housekeeping.INTERMEDIATE for path in (made / stage).rglob("*") if path.is_file()}
+    before = {path: path.stat().st_size for stage in INTERMEDIATE for path in (made / stage).rglob("*") if path.is_file()}
     freed = json.loads(slamcli("clean", "--keep", "results", "-r", "mine", "--json").stdout)["freed"]
     assert sum(freed.values()) == sum(before.values())
-    assert list(freed) == list(housekeeping.INTERMEDIATE)
+    assert list(freed) == list(INTERMEDIATE)
     assert sorted(path.name for path in made.iterdir() if path.is_dir()) == sorted(RESULTS)
     assert json.loads(slamcli("clean", "--keep", "results", "-r", "mine", "--json").stdout)["freed"] == {}
     states = RunDir.find("mine").states()
-    assert all(states[stage].state == MISSING for stage in housekeeping.INTERMEDIATE)
+    assert all(states[stage].state == MISSING for stage in INTERMEDIATE)
     for command in (["export-trajectory", "t.txt", "--frame", "level"], ["export-cloud", "c.ply"], ["render", "c.png", "--path"]):
         result = slamcli(*command, "-r", "mine")
         assert result.exit_code == 0, result.stderr
@@ -75,7 +75,7 @@ def test_clean_keeps_the_results_and_says_what_it_freed(made, slamcli, tmp_path)
     assert slamcli("clean", "-r", "mine").exit_code == 2
     lines = slamcli("status", "-r", "mine").stdout.splitlines()[1:]
     said = {name: state for name, state, *_ in map(str.split, lines)}
-    assert all(said[stage] == ("cleaned" if stage in housekeeping.INTERMEDIATE else "kept") for stage in MADE)
+    assert all(said[stage] == ("cleaned" if stage in INTERMEDIATE else "kept") for stage in MADE)
     assert "stale" not in "".join(lines)
 
 
