@@ -1,5 +1,7 @@
 """The poses of all frames as tracking finds them, each relative to its reference key frame, and the motion model."""
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from slamcli.geometry import se3
@@ -10,6 +12,19 @@ from slamcli.sparse_map.sparse_map import SparseMap
 # [1/m^2, 1/rad^2] of a motion that goes on as before, or that the background shows: known within 10 mm and 0.6 degrees.
 STEADY_INFORMATION = 1e4 * np.eye(6)
 STEADY_REACH = 4.0  # times the last step in time over which the motion is taken to go on: a gap says nothing about the motion within it
+
+
+@dataclass(frozen=True)
+class Location:
+    """Where a frame was found in the map, and what holds it there."""
+
+    T_cw: np.ndarray  # (4, 4)
+    kf: int  # its reference key frame
+    state: int  # TRACKED, ON_DEPTH or RELOCALIZED
+    landmark: np.ndarray  # (N,) int32, of each feature of the frame, -1 = none
+    n_inliers: int  # landmarks that hold it
+    is_anchored: bool = True  # whether every direction of motion was measured; else the frame before lent some
+    overlap: float | None = None  # where depth ICP placed it, the share of the reference key frame's depth that it shows
 
 
 class FramePoses:
@@ -55,11 +70,11 @@ class FramePoses:
         """Look up the map segment that a frame has its pose in, -1 if it is lost."""
         return -1 if self.ref_kf[i] < 0 else int(self._kf.segment[self.ref_kf[i]])
 
-    def attach(self, i: int, kf: int, T_cw: np.ndarray, *, state: int, n_inliers: int, is_anchored: bool = True) -> None:
-        """Record the pose of frame `i`, to propagate with key frame `kf`."""
-        self.ref_kf[i], self.state[i], self.n_inliers[i], self.latest = kf, state, n_inliers, i
-        self.T_kc[i] = se3.inverse(product(T_cw, self._kf.T_wk[kf]))
-        self.anchored = i if is_anchored else self.anchored
+    def attach(self, i: int, at: Location) -> None:
+        """Record the pose of frame `i`, to propagate with its reference key frame."""
+        self.ref_kf[i], self.state[i], self.n_inliers[i], self.latest = at.kf, at.state, at.n_inliers, i
+        self.T_kc[i] = se3.inverse(product(at.T_cw, self._kf.T_wk[at.kf]))
+        self.anchored = i if at.is_anchored else self.anchored
         self.lost_reason.pop(i, None)
 
     def stay(self, i: int) -> None:

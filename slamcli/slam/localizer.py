@@ -9,8 +9,8 @@ from slamcli.config.options import TrackConfig
 from slamcli.schema import ON_DEPTH, RELOCALIZED, TRACKED, Tracks
 from slamcli.slam import background_prior, initial_pose
 from slamcli.slam.depth_localization import DepthLocalizer, DepthMatch
-from slamcli.slam.depth_tracking import NO_FRAME_POINTS, DepthAligner, DepthPlacement, FramePoints
-from slamcli.slam.frame_poses import FramePoses
+from slamcli.slam.depth_tracking import NO_FRAME_POINTS, DepthAligner, FramePoints
+from slamcli.slam.frame_poses import FramePoses, Location
 from slamcli.slam.initial_pose import PreviousFrame
 from slamcli.slam.local_map import LocalMap, MapMatch
 from slamcli.slam.place_recognition import PlaceIndex
@@ -31,14 +31,6 @@ class KnownMap:
     sparse_map: SparseMap
     places: PlaceIndex  # of its key frames
     points: FramePoints = NO_FRAME_POINTS  # of the recording that it is of
-
-
-@dataclass(frozen=True)
-class Location:
-    """What holds a frame in the map."""
-
-    landmark: np.ndarray  # (N,) int32, of each feature of the frame, -1 = none
-    placement: DepthPlacement | None  # by depth ICP, where landmarks did not suffice
 
 
 class Localizer:
@@ -74,6 +66,8 @@ class Localizer:
         """Find the pose of frame `i`; frames come in order."""
         frame = self._frames[i]
         location = self.locate(i, frame)
+        if location is not None:
+            self.poses.attach(i, location)
         self.previous.remember(frame, nothing_seen(frame) if location is None else location.landmark)
 
     def tracks(self) -> Tracks:
@@ -81,10 +75,11 @@ class Localizer:
         return self.poses.tracks()
 
     def locate(self, i: int, frame: FrameFeatures) -> Location | None:
-        """Find the pose of frame `i` and record it; None, and the reason recorded, where it is lost.
+        """Find where frame `i` is, for the caller to attach; None where it is lost, and `poses.lost_reason` says why.
 
         By the landmarks that the frame before it saw; by depth ICP where these are few; by a key frame that looks alike where both fail;
-        by the background's motion, where that is known and nothing else holds the frame.
+        by the background's motion, where that is known and nothing else holds the frame. Depth may ask for a further key frame on the way,
+        see `DepthLocalizer`.
         """
         found = self._follow(i, frame)
         if found is not None and self.poses.has_background:
@@ -92,14 +87,14 @@ class Localizer:
         if found is None or found.estimate.n_inliers < self._settings.depth_icp_below:
             by_depth = self._by_depth.locate(i, frame, found)
             if by_depth is not None:
-                return self._record_by_depth(i, by_depth)
+                return _by_depth(by_depth)
         if found is not None:
-            return self._record(i, found, TRACKED)
+            return self._by_landmarks(found, TRACKED)
         found = self._relocalize(i, frame)
         if found is not None:
-            return self._record(i, found, RELOCALIZED)
+            return self._by_landmarks(found, RELOCALIZED)
         if self.poses.has_background and self.poses.has_pose(i - 1):
-            return self._record_by_background(i, frame)
+            return self._by_background(i, frame)
         self.poses.lost_reason.setdefault(i, self._why_lost(frame))
         return None
 
@@ -129,28 +124,20 @@ class Localizer:
         ids = ids[ids >= 0]
         return ids if len(ids) else self._sparse_map.landmarks_of(int(self.poses.ref_kf[i - 1]))
 
-    def _record_by_background(self, i: int, frame: FrameFeatures) -> Location:
+    def _by_background(self, i: int, frame: FrameFeatures) -> Location:
         """Place frame `i` where the background's motion takes the frame before it: no landmark holds it."""
-        kf = int(self.poses.ref_kf[i - 1])
-        self.poses.attach(i, kf, self.poses.predict(i, i - 1), state=TRACKED, n_inliers=0, is_anchored=False)
-        return Location(nothing_seen(frame), None)
+        kf, T_cw = int(self.poses.ref_kf[i - 1]), self.poses.predict(i, i - 1)
+        return Location(T_cw, kf, TRACKED, nothing_seen(frame), n_inliers=0, is_anchored=False)
 
     def _relocalize(self, i: int, frame: FrameFeatures) -> MapMatch | None:
         """Find frame `i` by a key frame that looks alike, wherever it is; None where none does."""
         place = None if self._sees_too_little(frame) else self._relocalizer.find(i, frame)
         return None if place is None else self._local_map.match(frame, *place, wanted=self._settings.relocalize_inliers)
 
-    def _record(self, i: int, found: MapMatch, state: int) -> Location:
-        """Record frame `i` relative to the key frame that shares the most of its landmarks."""
+    def _by_landmarks(self, found: MapMatch, state: int) -> Location:
+        """Place a frame relative to the key frame that shares the most of its landmarks."""
         kf = int(np.argmax(self._sparse_map.votes(found.landmark[found.landmark >= 0])))
-        self.poses.attach(i, kf, found.estimate.T_cw, state=state, n_inliers=found.estimate.n_inliers)
-        return Location(found.landmark, None)
-
-    def _record_by_depth(self, i: int, found: DepthMatch) -> Location:
-        """Record frame `i` relative to the key frame that its depth image was aligned with."""
-        placement, n_inliers = found.placement, int((found.landmark >= 0).sum())
-        self.poses.attach(i, placement.kf, placement.T_cw, state=ON_DEPTH, n_inliers=n_inliers, is_anchored=found.is_anchored)
-        return Location(found.landmark, placement)
+        return Location(found.estimate.T_cw, kf, state, found.landmark, found.estimate.n_inliers)
 
     def _sees_too_little(self, frame: FrameFeatures) -> bool:
         return len(frame) < self._settings.min_inliers
@@ -159,6 +146,12 @@ class Localizer:
         if self._sees_too_little(frame):
             return f"{len(frame)} features: blank or unreadable image"
         return f"fewer than {self._settings.min_inliers} of {len(frame)} features agree with the map"
+
+
+def _by_depth(found: DepthMatch) -> Location:
+    """Place a frame relative to the key frame that its depth image was aligned with."""
+    at, n_inliers = found.placement, int(np.count_nonzero(found.landmark >= 0))
+    return Location(at.T_cw, at.kf, ON_DEPTH, found.landmark, n_inliers, is_anchored=found.is_anchored, overlap=at.alignment.overlap)
 
 
 def nothing_seen(frame: FrameFeatures) -> np.ndarray:

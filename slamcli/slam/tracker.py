@@ -1,5 +1,7 @@
 """Build a map from one frame after the other: locate the frame, decide on a key frame, begin a new segment where tracking is lost for good."""
 
+from collections import Counter
+
 import numpy as np
 
 from slamcli.config.options import TrackConfig
@@ -7,8 +9,9 @@ from slamcli.geometry import se3
 from slamcli.geometry.algebra import product
 from slamcli.schema import KEY_FRAME, ON_DEPTH, TRACKED, Map, Tracks
 from slamcli.slam import background_prior, key_frames, rests
-from slamcli.slam.depth_tracking import DepthPlacement
-from slamcli.slam.localizer import KnownMap, Localizer, Location, nothing_seen
+from slamcli.slam.frame_poses import Location
+from slamcli.slam.key_frames import DEFAULT_RULE, DepthSighting, KeyFrameRule, Sighting
+from slamcli.slam.localizer import KnownMap, Localizer, nothing_seen
 from slamcli.slam.map_growth import MapGrowth
 from slamcli.slam.place_recognition import PlaceIndex
 from slamcli.slam.recording import NOTHING_KNOWN, KnownMotion, TrackingInput
@@ -24,10 +27,17 @@ class Tracker:
     """
 
     def __init__(
-        self, recording: TrackingInput, settings: TrackConfig, rng: np.random.Generator, *, motion: KnownMotion = NOTHING_KNOWN
+        self,
+        recording: TrackingInput,
+        settings: TrackConfig,
+        rng: np.random.Generator,
+        *,
+        motion: KnownMotion = NOTHING_KNOWN,
+        rule: KeyFrameRule = DEFAULT_RULE,
     ) -> None:
-        """Begin without a map; motion : what is known of the camera's motion beforehand."""
-        self._frames, self._settings, self._background = recording.frames, settings, motion.background
+        """Begin without a map; motion : what is known of the camera's motion beforehand; rule : when a frame becomes a key frame."""
+        self._frames, self._settings, self._background, self._rule = recording.frames, settings, motion.background, rule
+        self.key_frame_reasons: Counter[str] = Counter()  # how often each made a key frame
         self._is_still = rests.within(motion.stands_still, len(recording.frames), with_last=False)
         self._stays = rests.within(motion.stands_still, len(recording.frames), with_last=True)
         self._sparse_map = SparseMap(recording.frames.features)
@@ -49,21 +59,16 @@ class Tracker:
         """
         frame = self._frames[i]
         if self._segment < 0:
-            self._previous.remember(frame, self._start_segment(i, frame))
-            return
-        if self._is_still[i] and self._poses.has_pose(i - 1):
+            landmark = self._start_segment(i, frame)
+        elif self._is_still[i] and self._poses.has_pose(i - 1):
             self._poses.stay(i)
-            self._previous.remember(frame, nothing_seen(frame))
-            return
-        location = self._localizer.locate(i, frame)
-        if location is None:
+            landmark = nothing_seen(frame)
+        elif (location := self._localizer.locate(i, frame)) is None:
             landmark = self._lose(i, frame)
         else:
-            landmark, self._n_lost, self._segment = location.landmark, 0, self._poses.segment(i)
-            if self._stays[i] and self._poses.has_pose(i - 1):
-                self._poses.stay(i)  # the last of a rest, located for the landmarks that the next frame is tracked by
-            elif self._wants_key_frame(i, frame, location):
-                landmark = self._add_key_frame(i, frame, self._poses.T_wc(i), landmark)
+            self._poses.attach(i, location)
+            self._segment, self._n_lost = self._poses.segment(i), 0
+            landmark = self._grow(i, frame, location)
         self._previous.remember(frame, landmark)
 
     def map(self) -> Map:
@@ -79,24 +84,30 @@ class Tracker:
         """Say of each lost frame why it is lost."""
         return self._poses.lost_reason
 
-    def _wants_key_frame(self, i: int, frame: FrameFeatures, location: Location) -> bool:
-        if location.placement is not None:
-            return self._leaves_reference_by_depth(i, location.placement)
-        return key_frames.wants_key_frame(self._sighting(i, frame, location.landmark), self._settings)
+    def _grow(self, i: int, frame: FrameFeatures, location: Location) -> np.ndarray:
+        """Make frame `i`, which has its pose, a key frame where the rule asks for one; returns the landmarks of its features after that."""
+        if self._stays[i] and self._poses.has_pose(i - 1):
+            self._poses.stay(i)  # the last of a rest, located for the landmarks that the next frame is tracked by
+            return location.landmark
+        reason = self._reason_for_key_frame(i, frame, location)
+        if not reason:
+            return location.landmark
+        self.key_frame_reasons[reason] += 1
+        return self._add_key_frame(i, frame, self._poses.T_wc(i), location.landmark)
 
-    def _leaves_reference_by_depth(self, i: int, placement: DepthPlacement) -> bool:
-        if self._poses.anchored < i:
-            return False  # what rests on it would share the error that the frames before it lent
-        return key_frames.wants_key_frame_by_depth(self._poses.T_kc[i], placement.alignment.overlap, self._settings)
+    def _reason_for_key_frame(self, i: int, frame: FrameFeatures, location: Location) -> str:
+        if location.overlap is not None:
+            return self._rule.by_depth(DepthSighting(self._poses.T_kc[i], location.overlap, location.is_anchored), self._settings)
+        return self._rule.by_landmarks(self._sighting(i, frame, location.landmark), self._settings)
 
-    def _sighting(self, i: int, frame: FrameFeatures, landmark: np.ndarray) -> key_frames.Sighting:
+    def _sighting(self, i: int, frame: FrameFeatures, landmark: np.ndarray) -> Sighting:
         """Count what frame `i` sees, for the key-frame rule."""
         T_wc = self._poses.T_wc(i)
         kf, lm = self._sparse_map.kf, self._sparse_map.lm
         is_near, is_known, is_here = np.isfinite(frame.depth), landmark >= 0, kf.segment == self._segment
         seen = self._sparse_map.landmarks_of(int(self._poses.ref_kf[i]))
         least = min(2, np.count_nonzero(is_here))
-        return key_frames.Sighting(
+        return Sighting(
             n_landmarks=int(np.count_nonzero(is_known)),
             n_near_landmarks=int(np.count_nonzero(is_known & is_near)),
             n_near_new=int(np.count_nonzero(~is_known & is_near)),
@@ -112,7 +123,7 @@ class Tracker:
         known = landmark[landmark >= 0]
         # Landmarks enough to recognize a place by hold the key frame; depth alone might slide along a corridor.
         if self._poses.state[i] == ON_DEPTH and len(known) < self._settings.relocalize_inliers:
-            self._localizer.aligner.join(kf)
+            self._localizer.aligner.add_edges(kf)
         if self._background is not None and len(known) < background_prior.ENOUGH:
             self._join_by_background(kf, self._background)
         self._poses.make_key_frame(i, kf)
@@ -133,6 +144,7 @@ class Tracker:
         previous = self._previous.features
         if previous is None or self._poses.anchored != i - 1 or self._poses.state[i - 1] not in (TRACKED, ON_DEPTH):
             return None
+        self.key_frame_reasons[key_frames.FOR_DEPTH] += 1
         self._previous.remember(previous, self._add_key_frame(i - 1, previous, self._poses.T_wc(i - 1), self._previous.landmark))
         return int(self._poses.ref_kf[i - 1])
 
@@ -148,6 +160,7 @@ class Tracker:
             return nothing_seen(frame)
         self._segment, self._n_lost = len(np.unique(self._sparse_map.kf.segment)), 0
         self.lost_reason.pop(i, None)
+        self.key_frame_reasons[key_frames.BEGINS_SEGMENT] += 1
         return self._add_key_frame(i, frame, np.eye(4), nothing_seen(frame))
 
     def _lose(self, i: int, frame: FrameFeatures) -> np.ndarray:

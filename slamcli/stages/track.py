@@ -43,7 +43,7 @@ def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
         tracker, stands_still = _track(inputs, moving, background, cfg, tools)
         moving = moving_parts.find(inputs, tracker.tracks(), tracker.map(), tools)
     tracks = tracker.tracks()
-    map_ = map_segments.anchored(map_segments.ranked(tracker.map(), tracks), tracks)
+    map_ = map_segments.from_first_frames(map_segments.ranked(tracker.map(), tracks), tracks)
     artifacts.save(moving, out)
     artifacts.save(stands_still, out)
     lost = lost_spans(tracks.state, tracker.lost_reason)
@@ -63,6 +63,7 @@ def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
         "at_rest": int(np.diff(stands_still.rest_span).sum()),
         "segments": map_segments.n_segments(map_),
         "key_frames": len(map_.kf_frame),
+        "key_frame_reasons": dict(sorted(tracker.key_frame_reasons.items())),
         "landmarks": len(map_.lm_xyz),
         "edges": len(map_.edge_kf),
         "lost_spans": [list(span) for span in lost],

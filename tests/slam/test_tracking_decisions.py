@@ -9,8 +9,9 @@ from scenes import RATE, Scene, observe, orbit, room_points, sweep
 from slamcli.config.options import SensorConfig, TrackConfig
 from slamcli.geometry import se3
 from slamcli.schema import KEY_FRAME, LOST, ON_DEPTH, RELOCALIZED, TRACKED, Rests, frame_poses, frame_segments
-from slamcli.slam import background_prior, initial_pose
+from slamcli.slam import background_prior, initial_pose, localizer
 from slamcli.slam.depth_localization import DepthLocalizer, DepthMatch
+from slamcli.slam.key_frames import BEGINS_SEGMENT, FOR_DEPTH, KeyFrameRule
 from slamcli.slam.localizer import KnownMap, Localizer, nothing_seen
 from slamcli.slam.recording import NOTHING_KNOWN, KnownMotion
 from slamcli.slam.tracker import Tracker
@@ -29,6 +30,16 @@ def track(scene: Scene, *, motion: KnownMotion = NOTHING_KNOWN, until: int | Non
     for i in range(len(scene.T_gc) if until is None else until):
         tracker.process(i)
     return tracker
+
+
+def test_another_rule_decides_on_key_frames_and_the_reasons_are_counted():
+    scene = seen(sweep(11, length=0.1))
+    rule = KeyFrameRule(by_landmarks=lambda seen, _: "third frame" if seen.frames_since >= 3 else "")
+    tracker = Tracker(scene.recording(SENSOR), TrackConfig(), np.random.default_rng(0), rule=rule)
+    for i in range(11):
+        tracker.process(i)
+    assert tracker.map().kf_frame.tolist() == [0, 3, 6, 9]
+    assert tracker.key_frame_reasons == {BEGINS_SEGMENT: 1, "third frame": 3}
 
 
 def test_a_map_begins_with_just_as_many_features_with_depth_as_wanted():
@@ -293,6 +304,7 @@ def test_the_frame_before_becomes_a_key_frame_once_and_only_where_its_pose_was_m
     tracker = track(seen(sweep(8, length=0.1), blind=(6,)), until=6, key_frame_share=0.0)
     assert tracker.tracks().state[5] == TRACKED
     made = tracker._add_previous_as_key_frame(6)
+    assert tracker.key_frame_reasons[FOR_DEPTH] == 1
     assert made == 1 and tracker.map().kf_frame.tolist() == [0, 5] and tracker.tracks().state[5] == KEY_FRAME
     assert tracker._add_previous_as_key_frame(6) is None, "it is one already"
     tracker.process(6)
@@ -311,8 +323,9 @@ def test_a_pose_is_weighed_against_the_motion_since_the_frame_before_alone():
 def test_a_frame_that_depth_places_counts_the_landmarks_that_agree():
     tracker = track(seen(sweep(6, length=0.1)), until=5)
     landmark = np.array([4, -1, 0, -1, -1, 9, 2], np.int32)
-    placement = SimpleNamespace(kf=0, T_cw=np.eye(4))
-    location = tracker._localizer._record_by_depth(5, DepthMatch(placement, landmark, is_anchored=False))
+    placement = SimpleNamespace(kf=0, T_cw=np.eye(4), alignment=SimpleNamespace(overlap=0.5))
+    location = localizer._by_depth(DepthMatch(placement, landmark, is_anchored=False))
+    tracker._poses.attach(5, location)
     tracks = tracker.tracks()
     assert (tracks.state[5], tracks.n_inliers[5], tracks.ref_kf[5]) == (ON_DEPTH, 4, 0) and tracker._poses.anchored == 4
-    assert location.landmark is landmark and location.placement is placement
+    assert location.landmark is landmark and location.overlap == 0.5
