@@ -1,4 +1,4 @@
-"""Use the library's parts without the pipeline: a tracker, the alignment of two depth images, an octree, a bundle adjustment.
+"""Use the library's parts without the pipeline: a tracker, a loop closer, the alignment of two depth images, an octree, a bundle adjustment.
 
     python examples/parts.py [RECORDING]
 
@@ -11,12 +11,14 @@ import sys
 import numpy as np
 
 import slamcli
+from slamcli.console import silent
 from slamcli.dense.occupancy import OccupancyMap
 from slamcli.depth import icp
 from slamcli.estimation import bundle_adjustment
 from slamcli.estimation.bundle_problem import Problem, Variables
 from slamcli.geometry import octree, se3
 from slamcli.schema import LOST, Features, Map, Matches, Tracks, Words, frame_poses
+from slamcli.slam.loop_closing import LoopCloser
 from slamcli.slam.recording import TrackingInput
 from slamcli.slam.tracker import Tracker
 from slamcli.sparse_map import map_adjustment
@@ -28,6 +30,7 @@ def main(recording: str = "demo") -> None:
     """Call one part after the other, and print each field of what it returns."""
     run = slamcli.run(recording, until="match")
     tracks, map_ = track(run)
+    close_loops(run, map_)
     align(run, tracks, map_)
     map_space(run, tracks, map_)
     adjust(run, map_)
@@ -59,6 +62,24 @@ def track(run: slamcli.Run, n_frames: int = 40) -> tuple[Tracks, Map]:
     return tracks, map_
 
 
+def close_loops(run: slamcli.Run, map_: Map) -> Map:
+    """Look for places that the map shows twice, and move it so that they coincide."""
+    config = run.config()
+    features, words = run.directory.load(Features, "extract"), run.directory.load(Words, "match")
+    frames, sparse_map = FrameStore(features, run.camera("extract"), config.sensor), SparseMap.from_map(features, map_)
+    closer = LoopCloser(sparse_map, words, frames, config.loop, np.random.default_rng(config.seed))
+    tried = closer.close_loops(silent)
+    closed = sparse_map.snapshot()
+
+    print(f"LoopCloser.close_loops(), {len(map_.kf_frame)} key frames")
+    line("kf_i, kf_j", f"{len(tried)} pairs of key frames may show the same place: {[(c.kf_i, c.kf_j) for c in tried]}")
+    line("score", f"{[round(c.score, 2) for c in tried]}, how alike their words are; is_by_pose: {[c.is_by_pose for c in tried]}")
+    line("n_matches, n_inliers", f"{[(c.n_matches, c.n_inliers) for c in tried]}, by which each was verified")
+    line("reason, T_ij", f"{sum(c.is_accepted for c in tried)} are accepted, and have no reason against them: {[c.reason for c in tried]}")
+    line("T_wk", f"key frames moved by {1000 * max(map(apart, closed.T_wk, map_.T_wk)):.1f} mm at most")
+    return closed
+
+
 def align(run: slamcli.Run, tracks: Tracks, map_: Map) -> None:
     """Align the depth images of two neighbouring key frames, starting where the tracker put them."""
     dataset, camera, sensor = run.dataset(), run.camera("extract"), run.config().sensor
@@ -81,10 +102,10 @@ def map_space(run: slamcli.Run, tracks: Tracks, map_: Map) -> None:
     """Insert the depth image of the first key frame into an octree as one scan."""
     frame, option, camera = int(map_.kf_frame[0]), run.config().octree, run.camera("extract")
     depth, T_wc = run.dataset().depth(frame)[:: option.stride, :: option.stride], frame_poses(tracks, map_)[frame]
-    rays = camera.rays[:: option.stride, :: option.stride]
-    x_c = depth[..., None] * np.concatenate([rays, np.ones_like(rays[..., :1])], axis=2)
+    v, u = np.mgrid[: camera.height : option.stride, : camera.width : option.stride]
+    x_c = camera.backproject(camera.undistort(np.stack([u, v], axis=-1)), depth)
     space = OccupancyMap(option.resolution, hit=option.hit, miss=option.miss, clamp_min=option.clamp_min, clamp_max=option.clamp_max)
-    space.insert(se3.transform(T_wc, x_c.reshape(-1, 3).astype(np.float64)), T_wc[:3, 3], max_range=option.max_range)
+    space.insert(se3.transform(T_wc, x_c.reshape(-1, 3)), T_wc[:3, 3], max_range=option.max_range)
     cells = space.leaves()
     tree = octree.prune(cells)
 

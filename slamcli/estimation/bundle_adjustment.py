@@ -52,7 +52,7 @@ def adjust(problem: Problem, *, max_iterations: int = 10, tolerance: float = 1e-
 
 @dataclass(frozen=True)
 class Minimum:
-    """Where Levenberg-Marquardt came to."""
+    """The result of Levenberg-Marquardt."""
 
     at: Variables
     cost: list[float]  # at the start and after every accepted iteration
@@ -97,12 +97,12 @@ class Damping:
         self.value, self._growth = DAMPING_START, 2.0
 
     def relax(self, gain: float) -> None:
-        """Lower it after an accepted step; gain : the decrease of the cost over that foretold, 1 = the problem is as linear as it seems."""
+        """Lower the damping after an accepted step; gain : the decrease of the cost over that foretold, 1 = the problem is as linear as it seems."""
         shift = 2.0 * gain - 1.0
         self.value, self._growth = max(DAMPING_MIN, self.value * max(LARGEST_RELIEF, 1.0 - shift * shift * shift)), 2.0
 
     def tighten(self) -> None:
-        """Raise it after a rejected step, faster with each in a row."""
+        """Raise the damping after a rejected step, faster with each in a row."""
         self.value, self._growth = self.value * self._growth, 2.0 * self._growth
 
     @property

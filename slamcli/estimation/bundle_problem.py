@@ -143,7 +143,7 @@ class Problem:
         self._edge_terms.linearize(at.T_cw, self._loss.is_robust, self.normal.U, self.normal.b_c)
 
     def eliminate(self, damping: float, hold: np.ndarray) -> None:
-        """Fill the reduced camera system from them.
+        """Fill the reduced camera system from the normal equations.
 
         damping : factor on their diagonal (Marquardt); hold : (n,) added to the key frames'
         """

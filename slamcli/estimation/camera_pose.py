@@ -45,7 +45,7 @@ class Ransac:
     confidence: float = 0.9999  # rounds end early once a sample free of outliers has been drawn with this probability
 
     def agreement(self, camera: Camera, size: int) -> Agreement:
-        """Return it as the kernel takes it, with samples of `size` points."""
+        """Return when a point agrees, as the kernel takes it, with samples of `size` points."""
         return Agreement(camera.fx, camera.fy, self.threshold_px * self.threshold_px, size, self.confidence)
 
 

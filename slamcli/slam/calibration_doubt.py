@@ -1,4 +1,4 @@
-"""Signs that the calibration is not that of the recording, in words: focal length, principal point, lens, depth that lies off colour."""
+"""Signs that the calibration is not that of the recording, as text: focal length, principal point, lens, depth that lies off colour."""
 
 from slamcli.calibration import plausibility
 from slamcli.calibration.plausibility import Deviation, Rigidity

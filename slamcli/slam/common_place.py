@@ -46,7 +46,7 @@ MOVED_M, MOVED_RAD = 0.3, 0.1  # a closure that moves its view by less is one of
 
 
 @dataclass(frozen=True)
-class Evidence:
+class Comparison:
     """What two segments say of one another under a placement."""
 
     agreement: float  # share of the surface that the other segment sees again, of that which it sees again or looks through
@@ -90,13 +90,16 @@ class Jury:
         """Say why two segments cannot be one place under a placement, "" when they can."""
         return self.weigh(found).objection
 
-    def weigh(self, found: Join) -> Evidence:
+    def weigh(self, found: Join) -> Comparison:
         """Compare the views of two segments under a placement of one to the other."""
         segment = self._sparse_map.kf.segment
         return self._weigh(np.flatnonzero(segment == found.a), np.flatnonzero(segment == found.b), found.T_ab)
 
     def objection_to_closure(self, closure: Candidate) -> str:
-        """Say why the two sides of a verified closure within a segment cannot be one place, "" when they can, or when it moves its view little."""
+        """Say why the two sides of a verified closure within a segment cannot be one place.
+
+        Returns "" when they can, or when the closure moves its view little.
+        """
         assert closure.T_ij is not None, "only a verified closure has a pose"
         kf, i, j = self._sparse_map.kf, closure.kf_i, closure.kf_j
         T_wi = product(kf.T_wk[j], se3.inverse(closure.T_ij))
@@ -109,20 +112,20 @@ class Jury:
         a, b = (rows[np.abs(rows - side) <= reach] for side in (j, i))
         return self._weigh(a, b[b > a[-1]], move).objection
 
-    def _weigh(self, a: np.ndarray, b: np.ndarray, T_ab: np.ndarray) -> Evidence:
+    def _weigh(self, a: np.ndarray, b: np.ndarray, T_ab: np.ndarray) -> Comparison:
         """Compare the views of key frames b, moved by T_ab, with those of key frames a, until something speaks against the motion."""
         T_ak = np.array(self._sparse_map.kf.T_wk)
         T_ak[b] = product(T_ab, T_ak[b])
         spot = T_ak[:, :3, 3] + AHEAD * T_ak[:, :3, 2]
         apart = np.linalg.norm(spot[b][:, None] - spot[a], axis=2)
-        evidence = Evidence(self._agreement(T_ak, a, b, apart))
-        if not evidence.objection:
+        comparison = Comparison(self._agreement(T_ak, a, b, apart))
+        if not comparison.objection:
             pairs = self._near_pairs(T_ak, a, b)
-            evidence = replace(evidence, n_pairs=len(pairs), n_alike=sum(self._are_alike(T_ak, *pair) for pair in pairs))
-        if not evidence.objection:
+            comparison = replace(comparison, n_pairs=len(pairs), n_alike=sum(self._are_alike(T_ak, *pair) for pair in pairs))
+        if not comparison.objection:
             looks = [(pair, np.eye(4)) for pair in pairs] + [(pair, T_ab) for pair in self._near_pairs(T_ak, b, a)]
-            evidence = replace(evidence, n_otherwise=self._otherwise(T_ak, looks))
-        return evidence
+            comparison = replace(comparison, n_otherwise=self._otherwise(T_ak, looks))
+        return comparison
 
     def _agreement(self, T_ak: np.ndarray, a: np.ndarray, b: np.ndarray, apart: np.ndarray) -> float:
         n, frame = len(self._depth), self._sparse_map.kf.frame

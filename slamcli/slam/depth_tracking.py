@@ -50,7 +50,7 @@ class FramePoints:
 
 
 class NoFramePoints(FramePoints):
-    """Of a recording whose depth images are not looked at."""
+    """No points: the depth images of the recording are not looked at."""
 
     def __init__(self) -> None:
         """Take nothing."""
@@ -96,7 +96,8 @@ class DepthAligner:
     def place(self, frame: int, kf: int, starts: list[np.ndarray], prior: PosePrior | None = None) -> DepthPlacement | None:
         """Align a frame with key frame `kf` from the first of the poses `starts` (T_cw) that leads to a sound placement.
 
-        prior : of T_cw. None where depth is missing.
+        The key frame's points are moved onto the frame's, so that T_ij of `icp.align` is T_ck. None where depth is missing.
+        prior : of T_cw
         """
         target, source = self._frame_points.of(frame), self._map_frame_points.of(int(self._sparse_map.kf.frame[kf]))
         if target is None or source is None:
@@ -127,18 +128,18 @@ class DepthAligner:
         found = icp.align(np.eye(4), here, there)
         return found.agreement >= MIN_AGREEMENT and icp.n_determined(found.information, found.depth) == icp.DIRECTIONS
 
-    def join(self, kf: int) -> int:
+    def add_edges(self, kf: int) -> int:
         """Add edges between a key frame and the earlier ones around that show the same; returns how many."""
         n = 0
         table = self._sparse_map.kf
         around = self.around(table.T_wk[kf], int(table.segment[kf]))
         for other in around[around < kf]:
-            n += self.join_pair(kf, int(other))
+            n += self.add_edge(kf, int(other))
             if n == JOIN_MOST:
                 break
         return n
 
-    def join_covisible(self, T_cd: np.ndarray, *, most: int, least: int, workers: int = 1) -> int:
+    def add_covisible_edges(self, T_cd: np.ndarray, *, most: int, least: int, workers: int = 1) -> int:
         """Add edges between each key frame and up to `most` earlier ones that share at least `least` landmarks; returns how many.
 
         T_cd : (K, 4, 4) each key frame's camera when its depth was measured, to its camera when colour was; workers : threads
@@ -153,7 +154,7 @@ class DepthAligner:
         found = chain.from_iterable(ordered_map(edges, range(1, len(self._sparse_map.kf)), workers=workers))
         return sum(self._add(edge) for edge in list(found))
 
-    def join_pair(self, kf_i: int, kf_j: int, T_cd: np.ndarray | None = None) -> bool:
+    def add_edge(self, kf_i: int, kf_j: int, T_cd: np.ndarray | None = None) -> bool:
         """Add an edge between two key frames if their depth images show the same and determine how the two lie."""
         return self._add(self._edge(kf_i, kf_j, T_cd))
 

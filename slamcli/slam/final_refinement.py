@@ -31,7 +31,7 @@ class DepthConstraints:
 
 @dataclass(frozen=True)
 class Refinement:
-    """By what a map and its frames are refined."""
+    """Settings of the final refinement."""
 
     settings: TrackConfig
     depth: DepthConstraints
@@ -51,7 +51,7 @@ def refine_all(
     if depth.most:
         T_cd = rolling_shutter.depth_to_colour(frames.features, depth.timing, sparse_map.kf.frame)
         points = depth.points.under(frames.camera)
-        DepthAligner(sparse_map, points, points).join_covisible(T_cd, most=depth.most, least=SHARED, workers=workers)
+        DepthAligner(sparse_map, points, points).add_covisible_edges(T_cd, most=depth.most, least=SHARED, workers=workers)
     kfs = np.arange(len(sparse_map.kf), dtype=np.int32)
     result = map_adjustment.adjust(sparse_map, kfs, frames.camera, frames.sensor, max_iterations=by.iterations, edge_weight=depth.weight)
     tracks = refine_frames(sparse_map, tracked, by.settings, progress, workers=workers)

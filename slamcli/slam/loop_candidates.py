@@ -43,7 +43,8 @@ def find_alike(sparse_map: SparseMap, places: PlaceIndex, settings: LoopConfig) 
     for i in range(len(sparse_map.kf)):
         scores = places.scores(i)
         shared = sparse_map.votes(sparse_map.landmarks_of(i))
-        # Each vocabulary has its own range of scores: a place seen again should look as alike as the worst of the neighbours, [ORB-SLAM].
+        # Each vocabulary has its own range of scores: a place seen again should look nearly as alike as the neighbours do, here a share of their
+        # mean score; [ORB-SLAM] takes the least.
         neighbours = np.flatnonzero(shared >= settings.min_shared)
         neighbours = neighbours[neighbours != i]
         least = (

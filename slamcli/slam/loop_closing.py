@@ -20,7 +20,7 @@ from slamcli.sparse_map.frame import FrameStore
 from slamcli.sparse_map.landmark_fusion import fuse_landmarks
 from slamcli.sparse_map.sparse_map import SparseMap
 
-MOVED_M, MOVED_RAD = 0.005, 0.003  # a pixel or two: verification looks for landmarks in windows of sixteen
+SETTLED_M, SETTLED_RAD = 0.005, 0.003  # a pixel or two: verification looks for landmarks in windows of sixteen
 
 
 def no_objection(_: Join | Candidate) -> str:
@@ -30,7 +30,7 @@ def no_objection(_: Join | Candidate) -> str:
 
 @dataclass(frozen=True)
 class Objections:
-    """Who says why what looks alike cannot be one place, "" when it can."""
+    """Functions that give the reason against a join or a closure, "" when there is none."""
 
     to_join: Callable[[Join], str] = no_objection  # of two segments; those of one recording are joined when several closures agree
     to_closure: Callable[[Candidate], str] = no_objection  # of the two sides of a verified closure within one segment
@@ -42,7 +42,7 @@ NO_OBJECTIONS = Objections()
 def has_moved(before: np.ndarray, after: np.ndarray) -> bool:
     """Say whether any key frame, of poses (K, 4, 4), moved so far that candidates would be proposed or verified otherwise."""
     motion = se3.log(product(se3.inverse(before), after))
-    return bool((np.linalg.norm(motion[:, :3], axis=1) > MOVED_M).any() or (np.linalg.norm(motion[:, 3:], axis=1) > MOVED_RAD).any())
+    return bool((np.linalg.norm(motion[:, :3], axis=1) > SETTLED_M).any() or (np.linalg.norm(motion[:, 3:], axis=1) > SETTLED_RAD).any())
 
 
 class LoopCloser:
@@ -109,17 +109,13 @@ class LoopCloser:
         return [c for c in candidates if not self._is_between_segments(c)]
 
     def _verify(self, candidates: Iterable[Candidate]) -> list[Candidate]:
-        """Verify the candidates that claim no revisit decided before; returns those accepted."""
-        # One closure joins its whole neighbourhood: fusion finds the rest. And where the graph contradicted one, words would only
-        # name its like again; what the present poses name is another idea.
+        """Verify the candidates that claim no revisit decided before, and note what becomes of them; returns those accepted."""
         span, fates = self._settings.closure_spacing, self.fate.values()
         closed = Claims((c for c in fates if c.is_accepted), span=span)
         contradicted = Claims((c for c in fates if not c.is_accepted and c.T_ij is not None), span=span)
         accepted = []
         for candidate in candidates:
-            if closed.cover(candidate) or (
-                not candidate.is_by_pose and (contradicted.cover(candidate) or self._matches_too_little(candidate))
-            ):
+            if self._is_settled(candidate, closed, contradicted):
                 continue
             verified = self._verified(candidate)
             if verified.is_accepted and (reason := self._objections.to_closure(verified)):
@@ -129,6 +125,15 @@ class LoopCloser:
                 accepted.append(verified)
                 closed.add(verified)
         return accepted
+
+    def _is_settled(self, candidate: Candidate, closed: Claims, contradicted: Claims) -> bool:
+        """Say whether a candidate need not be verified, as that of its revisit is decided; its fate stays what it was."""
+        if closed.cover(candidate):
+            return True  # one closure joins its whole neighbourhood: fusion finds the rest
+        if candidate.is_by_pose:
+            return False  # what the present poses name is another idea than what words named before
+        # Where the graph contradicted one, words would only name its like again.
+        return contradicted.cover(candidate) or self._matches_too_little(candidate)
 
     def _matches_too_little(self, candidate: Candidate) -> bool:
         """Say whether a pair that its words propose was tried before and had too few matches: these do not depend on the map."""
@@ -146,7 +151,10 @@ class LoopCloser:
         return list(itertools.compress(closures, is_kept))
 
     def _fuse_and_adjust(self, closures: list[Candidate], *, is_last: bool = False) -> None:
-        """Fuse what both sides of the closures see, and adjust the whole map; where the final refinement follows, roughly, at last not at all."""
+        """Fuse what both sides of the closures see, and adjust the whole map.
+
+        Where the final refinement is to follow, the map is adjusted coarsely, and after the last round not at all.
+        """
         sparse_map = self._sparse_map
         for closure in closures:
             self._fuse_around(closure)

@@ -26,7 +26,10 @@ RATIO = 0.9  # of the best match's distance to the second best's
 def verify(
     sparse_map: SparseMap, words: Words, candidate: Candidate, frames: FrameStore, settings: LoopConfig, rng: np.random.Generator
 ) -> Candidate:
-    """Check a candidate by geometry: 3-D to 3-D RANSAC, for a pair proposed by its poses these; then the landmarks around j looked for in i."""
+    """Verify a candidate: find a relative pose, and with it the landmarks around j in i.
+
+    The pose is the map's for a pair that its poses propose; of one that its words propose it is found by RANSAC over the matches with depth.
+    """
     frame_i, frame_j = (frames[int(sparse_map.kf.frame[kf])] for kf in (candidate.kf_i, candidate.kf_j))
     if candidate.is_by_pose:
         return _find_landmarks(sparse_map, candidate, frame_i, se3.inverse(sparse_map.kf.T_wk[candidate.kf_i]), settings)

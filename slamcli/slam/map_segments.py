@@ -19,7 +19,7 @@ def ranked(map_: Map, tracks: Tracks, main: int = 0) -> Map:
     return replace(map_, kf_segment=np.argsort(order)[map_.kf_segment].astype(np.int32))
 
 
-def anchored(map_: Map, tracks: Tracks) -> Map:
+def from_first_frames(map_: Map, tracks: Tracks) -> Map:
     """Express each segment in the camera frame of its first frame with a pose, so that every trajectory begins at the identity.
 
     Joining two segments, or finding a frame before the first key frame, leaves another camera than the first at the world's origin.

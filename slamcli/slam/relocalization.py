@@ -24,7 +24,7 @@ class Relocalizer:
         self._settings, self._rng = settings, rng
 
     def find(self, i: int, frame: FrameFeatures) -> tuple[np.ndarray, np.ndarray] | None:
-        """Find T_cw (4, 4) of frame `i` and the landmarks (N,) that it shows in the likest key frame that agrees; None in none."""
+        """Find T_cw (4, 4) of frame `i` and the landmarks (N,) that it shows in the likest key frame that agrees; None where none does."""
         kfs, scores = self._places.query(bow_vector(self._words, i))
         for kf in kfs[np.argsort(-scores, kind="stable")[: self._settings.relocalize_candidates]]:
             row, ids = self._match_key_frame(int(kf), frame)

@@ -40,7 +40,7 @@ class MovingSightings:
     """The evidence of all views that following needs, and what it says, (F, v, u) each."""
 
     depth: np.ndarray  # float16 [m], 0 = unknown
-    since: np.ndarray  # float16 [s] as in Evidence
+    since: np.ndarray  # float16 [s] as in PlaceEvidence
     until: np.ndarray  # float16 [s]
     is_sure: np.ndarray  # bool, surely moving
     is_moving: np.ndarray  # bool, with what moves along

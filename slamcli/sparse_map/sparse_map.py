@@ -90,7 +90,7 @@ class SparseMap:
         self.lm_of_row[rows] = ids
 
     def add_edge(self, kf_i: int, kf_j: int, T_ij: np.ndarray, information: np.ndarray) -> None:
-        """Note that shape says ``x_i = T_ij @ x_j`` of two key frames; information (6, 6) of the left twist of T_ij."""
+        """Add a measured relative pose of two key frames, ``x_i = T_ij @ x_j``; information (6, 6) of the left twist of T_ij."""
         self.edge.append(1, kf=(kf_i, kf_j), T_ij=T_ij, information=information)
 
     def joined_by_edges(self, kfs: np.ndarray) -> np.ndarray:

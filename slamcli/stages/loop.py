@@ -49,7 +49,7 @@ def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
         edges = DepthConstraints(points, when, most=cfg.loop.depth_icp_edges, weight=cfg.loop.depth_icp_weight)
         by, tracked = Refinement(cfg.track, edges, cfg.loop.iterations), TrackedRecording(frames, tracks, inputs.load(Rests, "track"))
         tracks, _ = final_refinement.refine_all(sparse_map, tracked, by, progress=tools.progress, workers=tools.workers)
-    map_ = map_segments.anchored(main_first(sparse_map.snapshot(), tracks, cfg.loop.main_segment), tracks)
+    map_ = map_segments.from_first_frames(main_first(sparse_map.snapshot(), tracks, cfg.loop.main_segment), tracks)
 
     write_pose_graph(out / "posegraph.g2o", map_.T_wk, loop_pose_graph.build(sparse_map, accepted, cfg.loop))
     write_candidates(out / "candidates.csv", tried)

@@ -40,7 +40,7 @@ def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
         for one in doubts:
             tools.warn(one.text)
         summary |= doubt.to_summary(doubts)
-        map_ = map_segments.anchored(sparse_map.snapshot(), tracks)
+        map_ = map_segments.from_first_frames(sparse_map.snapshot(), tracks)
     save_map(out, inputs.load(FrameTimes, "extract"), tracks, map_)
     artifacts.save(sensing.timing, out)
     write_camera(out, sensing.camera)

@@ -83,6 +83,15 @@ def test_the_notebook_runs(here: Path, room: Path) -> None:
     assert (here / "runs" / "tour" / "report.html").is_file()
 
 
+def test_another_key_frame_rule_makes_another_map_of_the_same_trajectory(play, room: Path) -> None:
+    default, thrifty, apart = play("own_key_frame_rule.py", room).splitlines()
+    fewer, more = (int(text.split()[1]) for text in (thrifty, default))
+    assert 2 <= fewer < more
+    assert f"half is left: {fewer - 1}" in thrifty
+    assert thrifty.endswith(" 0 lost") and default.endswith(" 0 lost")
+    assert 0.0 < float(apart.split()[4]) < 20.0
+
+
 def test_the_parts_work_without_the_pipeline_and_print_each_field(play, room: Path) -> None:
     printed = play("parts.py", room)
     assert "40 of 40 frames tracked" in printed

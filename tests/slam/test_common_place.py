@@ -40,7 +40,7 @@ def test_a_place_looks_different_where_far_fewer_landmarks_are_found_than_elsewh
 
 
 def test_one_place_that_looks_different_is_no_objection_and_two_are() -> None:
-    evidence = [common_place.Evidence(agreement=0.99, n_pairs=20, n_alike=20, n_otherwise=n) for n in (0, 1, 2)]
+    evidence = [common_place.Comparison(agreement=0.99, n_pairs=20, n_alike=20, n_otherwise=n) for n in (0, 1, 2)]
     assert [bool(one.objection) for one in evidence] == [False, False, True]
 
 

@@ -149,11 +149,11 @@ def test_key_frames_are_joined_only_where_they_show_the_same():
         sparse_map.add_key_frame(frame, T_wc[frame])
     frame_points = FramePoints(depth, KINECT, SENSOR)
     shape = DepthAligner(sparse_map, frame_points, frame_points)
-    assert shape.join_pair(1, 0)
+    assert shape.add_edge(1, 0)
     e = se3.log(sparse_map.edge.T_ij[0] @ se3.inverse(T_wc[0]) @ T_wc[2])
     assert np.linalg.norm(e) < 0.006
     sparse_map.kf.T_wk[2] = se3.exp([2.0, 0.0, 0.0, 0.0, 0.0, 0.0]) @ sparse_map.kf.T_wk[2]
-    assert not shape.join_pair(2, 0) and shape.join(2) == 0 and len(sparse_map.edge) == 1
+    assert not shape.add_edge(2, 0) and shape.add_edges(2) == 0 and len(sparse_map.edge) == 1
 
 
 def test_edges_hold_for_the_instants_of_the_colour_images():
@@ -163,7 +163,7 @@ def test_edges_hold_for_the_instants_of_the_colour_images():
     for kf, frame in enumerate((0, 2)):
         sparse_map.add_key_frame(frame, T_wd[frame] @ se3.inverse(T_cd[kf]))
     frame_points = FramePoints(corner(), KINECT, SENSOR)
-    assert DepthAligner(sparse_map, frame_points, frame_points).join_pair(1, 0, T_cd)
+    assert DepthAligner(sparse_map, frame_points, frame_points).add_edge(1, 0, T_cd)
     e = se3.log(sparse_map.edge.T_ij[0] @ se3.inverse(sparse_map.kf.T_wk[0]) @ sparse_map.kf.T_wk[1])
     assert np.linalg.norm(e) < 0.006
 
@@ -237,7 +237,7 @@ def test_key_frames_are_joined_the_same_with_any_number_of_threads():
     for workers in (1, 3):
         sparse_map = revisit(frames)
         assert (
-            DepthAligner(sparse_map, frame_points, frame_points).join_covisible(
+            DepthAligner(sparse_map, frame_points, frame_points).add_covisible_edges(
                 np.tile(np.eye(4), (4, 1, 1)), most=6, least=30, workers=workers
             )
             == 6

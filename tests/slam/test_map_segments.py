@@ -95,7 +95,7 @@ def test_anchoring_moves_key_frames_landmarks_and_frames_of_a_segment_together(a
         T = se3.exp(np.random.default_rng(segment).normal(size=6))
         moved.T_wk[map_.kf_segment == segment] = T @ map_.T_wk[map_.kf_segment == segment]
         moved.lm_xyz[lm_segment == segment] = se3.transform(T, map_.lm_xyz[lm_segment == segment])
-    anchored = map_segments.anchored(moved, tracks)
+    anchored = map_segments.from_first_frames(moved, tracks)
     np.testing.assert_allclose(anchored.T_wk, map_.T_wk, atol=1e-9)
     np.testing.assert_allclose(anchored.lm_xyz, map_.lm_xyz, atol=1e-9)
 
@@ -107,7 +107,7 @@ def test_a_frame_found_before_the_first_key_frame_is_the_origin(apart):
     ref_kf = tracks.ref_kf.copy()
     ref_kf[0] = 1
     early = replace(tracks, T_kc=T_kc, ref_kf=ref_kf)
-    np.testing.assert_allclose(frame_poses(early, map_segments.anchored(map_, early))[0], np.eye(4), atol=1e-12)
+    np.testing.assert_allclose(frame_poses(early, map_segments.from_first_frames(map_, early))[0], np.eye(4), atol=1e-12)
 
 
 def test_another_segment_can_be_asked_for(apart):
