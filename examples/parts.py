@@ -96,6 +96,7 @@ def align(run: slamcli.Run, tracks: Tracks, map_: Map) -> None:
     line("rms", f"{found.rms:.2f} standard deviations of a reading")
     line("information", f"inverse covariance; {icp.n_determined(found.information, found.depth)} of 6 directions are determined")
     line("depth", f"{found.depth:.2f} m, mean of the points of j")
+    line("iterations, is_converged", f"{found.iterations}, {found.is_converged}")
 
 
 def map_space(run: slamcli.Run, tracks: Tracks, map_: Map) -> None:

@@ -92,6 +92,8 @@ class Alignment:
     agreement: float  # share of those that meet that agree
     rms: float  # of the residuals in sigma
     depth: float  # [m] mean of the points of j
+    iterations: int  # of all passes
+    is_converged: bool  # whether the last pass ended by a step that is short enough, not by its number
 
 
 def _blocks(columns: int) -> tuple[int, int, int]:
@@ -164,7 +166,9 @@ def align(T_ij: np.ndarray, source: OrientedPoints, target: OrientedPoints, *, p
         H_prior = H_prior + prior.information
         b_prior = product(prior.information, se3.log(product(prior.T, se3.inverse(T))))
     found = PoseEquations(np.zeros((6, 6)), np.zeros(6))
-    met, agree, cost = kernels.align(T, source.points, target.points, target.view, SCHEDULE, RULE, PoseEquations(H_prior, b_prior), found)
+    met, agree, cost, iterations, is_converged = kernels.align(
+        T, source.points, target.points, target.view, SCHEDULE, RULE, PoseEquations(H_prior, b_prior), found
+    )
     factor = READINGS_AS_ONE * max(cost / max(agree, 1), kernels.LEAST_VARIANCE_FACTOR)
     return Alignment(
         T_ij=se3.orthonormalize(T),
@@ -173,6 +177,8 @@ def align(T_ij: np.ndarray, source: OrientedPoints, target: OrientedPoints, *, p
         agreement=agree / max(met, 1),
         rms=float(np.sqrt(cost / max(agree, 1))),
         depth=float(source.xyz[:, 2].mean()) if len(source) else np.nan,
+        iterations=iterations,
+        is_converged=bool(is_converged),
     )
 
 

@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
-from numba import b1, f4, f8, i4, i8
+from numba import boolean, f4, f8, i4, i8
 
 from slamcli.geometry.cholesky import solve_damped
 from slamcli.geometry.se3 import left_update
@@ -47,9 +47,9 @@ class PoseEquations(NamedTuple):
 class _Round(NamedTuple):
     """One round of Gauss-Newton."""
 
-    step: i8  # every so many-th point of j takes part
+    every: i8  # n-th point of j takes part
     reach: f8  # [m] that points which meet may be apart
-    is_final: b1  # whether no step follows
+    is_final: boolean  # whether no step follows
 
 
 @kernel(error_model="numpy")
@@ -88,25 +88,27 @@ def _shown_at(x, y, z, view):
 
 @kernel(error_model="numpy")
 def _normal_equations(T, source, target, view, now, rule, out):
-    """Write H = sum w J^T J and b = -sum w J^T r over every `now.step`-th point of j; return points met, points that agree, sum of w chi2.
+    """Write H = sum w J^T J and b = -sum w J^T r over every `now.every`-th point of j; return points met, points that agree, sum of w chi2.
 
     r = n_i (q - x_i) is the distance from the plane of i, J = (n_i, q x n_i) its derivative by the left twist of T_ij, w its inverse
     variance times Huber's weight from chi2 = `rule.limit` on.
 
     Normals err, and so add to H in directions in which nothing is known: over a plane, as if it were rough. In the end, therefore,
     H = sum w (J^T M + M^T J) / 2, with M the same of the normal of j: their errors are independent, and their products vanish on average.
+
+    Written out entry by entry for speed; tests/depth/test_icp.py has its slow twin.
     """
     xyz_j, normal_j, variance_j = source
     xyz_i, normal_i, variance_i = target
     min_cosine, limit, _ = rule
-    step, reach, is_final = now
+    every, reach, is_final = now
     H, b = out
     h00 = h01 = h02 = h03 = h04 = h05 = h11 = h12 = h13 = h14 = h15 = h22 = h23 = h24 = h25 = 0.0
     h33 = h34 = h35 = h44 = h45 = h55 = b0 = b1 = b2 = b3 = b4 = b5 = cost = 0.0
     T00, T01, T02, T03, T10, T11, T12, T13 = T[0, 0], T[0, 1], T[0, 2], T[0, 3], T[1, 0], T[1, 1], T[1, 2], T[1, 3]
     T20, T21, T22, T23 = T[2, 0], T[2, 1], T[2, 2], T[2, 3]
     met, agree = 0, 0
-    for j in range(0, len(xyz_j), step):
+    for j in range(0, len(xyz_j), every):
         x, y, z = xyz_j[j, 0], xyz_j[j, 1], xyz_j[j, 2]
         qx, qy, qz = T00 * x + T01 * y + T02 * z + T03, T10 * x + T11 * y + T12 * z + T13, T20 * x + T21 * y + T22 * z + T23
         i = _shown_at(qx, qy, qz, view)
@@ -181,20 +183,24 @@ def align(
     """Move T_ij (4, 4), in place, to where the points of j, the source, agree best with those of i; write H (upper triangle) and b there.
 
     A point of j meets the one of i that `view` shows where it projects to. They agree when they are within reach and their normals are
-    alike. Returns points met, points that agree, sum of w chi2.
+    alike. Returns points met, points that agree, sum of w chi2, iterations, whether the last step was short enough to end its pass.
 
-    schedule : (S, 4) rows of step, reach [m], iterations at most, length of a step of the motion that ends them
+    schedule : (S, 4) rows of every (so many-th point), reach [m], iterations at most, length of a step of the motion that ends them
     known : what is known at the start besides
     """
     A, g, total, xi, L = np.empty((6, 6)), np.empty(6), np.zeros(6), np.empty(6), np.empty((6, 6))
-    s, done = 0, 0
+    s, done, iterations, is_short = 0, 0, 0, True
     while True:  # one call, so that what it calls is compiled into this kernel once
         now = _Round(1, schedule[s - 1, 1], True) if s == len(schedule) else _Round(int(schedule[s, 0]), schedule[s, 1], False)
         met, agree, cost = _normal_equations(T_ij, source, target, view, now, rule, out)
         if now.is_final:
-            return met, agree, cost
+            return met, agree, cost, iterations, is_short
         done += 1
-        weight = now.step / (rule.readings_as_one * max(cost / max(agree, 1), LEAST_VARIANCE_FACTOR))
+        iterations += 1
+        # One reading weighs 1 / (readings_as_one s^2), and stands for all that this pass leaves out; s^2 = max(cost / n, 0.01) is how much noisier the
+        # depth is than the model says.
+        weight = now.every / (rule.readings_as_one * max(cost / max(agree, 1), LEAST_VARIANCE_FACTOR))
+        # (weight H + H_prior) xi = weight b + b_prior - H_prior total: the prior is of the start, and so pulls back what was moved since.
         for i in range(6):
             g[i] = weight * out.b[i] + known.b[i]
             for j in range(6):
@@ -202,9 +208,10 @@ def align(
                 g[i] -= known.H[i, j] * total[j]
         length = 0.0
         if solve_damped(A, g, 0.0, L, xi):
-            left_update(T_ij, xi)
+            left_update(T_ij, xi)  # T <- exp(xi) T
             for i in range(6):
                 total[i] += xi[i]
                 length += xi[i] * xi[i]
-        if length < schedule[s, 3] ** 2 or done == schedule[s, 2]:
+        is_short = length < schedule[s, 3] ** 2
+        if is_short or done == schedule[s, 2]:
             s, done = s + 1, 0

@@ -23,7 +23,7 @@ ITERATIONS, ROUNDS = 10, 4
 
 
 class Hypotheses(NamedTuple):
-    """Motions of which each is to bring all points onto their rays."""
+    """Candidate motions, each tested against all points."""
 
     T: f8[:, :, ::1]  # (M, 3, 4), one per round; NaN = its sample had no solution
     p: f8[:, ::1]  # (N, 3) m
@@ -242,7 +242,7 @@ def _sort_again(chi2, depth, loss, is_inlier):
 
 @kernel(error_model="numpy")
 def refine(T: f8[:, ::1], given: Seen, camera: f8[::1], loss: Huber, is_inlier: b1[::1]):
-    """Levenberg-Marquardt on T (4, 4), with the inliers (N,) found anew after each round, in place.
+    """Refine T (4, 4) in place by Levenberg-Marquardt, with the inliers (N,) found anew after each round.
 
     given : as it was measured; camera : fx, fy, cx, cy [px]
     is_inlier : written; an observation with a value that is not finite is never one

@@ -104,6 +104,18 @@ def test_the_error_stays_within_what_the_information_says():
     assert 1e-3 < np.mean(chi2) < 12.0  # 6 were each reading independent; real sensors err together over far more than simulated ones
 
 
+def test_iterations_are_counted_and_end_where_steps_are_short(monkeypatch):
+    moved = HERE @ se3.exp(np.array([0.08, -0.03, 0.1, 0.03, 0.06, -0.02]))
+    source, target = relief(HERE, 1), relief(moved, 2)
+    found = icp.align(np.eye(4), source, target)
+    again = icp.align(found.T_ij, source, target)
+    assert again.is_converged
+    assert len(icp.SCHEDULE) <= again.iterations < found.iterations <= icp.SCHEDULE[:, 2].sum()
+    monkeypatch.setattr(icp, "SCHEDULE", np.array([icp.Pass(8, 0.3, 1, 1e-9)]))
+    cut_short = icp.align(np.eye(4), source, target)
+    assert cut_short.iterations == 1 and not cut_short.is_converged
+
+
 def test_places_that_differ_do_not_agree():
     there = look_along([5.5, 2.0, 1.0], 0.3, 0.1)
     found = icp.align(np.eye(4), relief(HERE, 1), relief(there, 2))
@@ -120,7 +132,7 @@ def test_the_gradient_equals_numerical_derivatives():
     H, b, still = np.zeros((6, 6)), np.zeros(6), np.array([[1.0, 0.05, 1.0, 1.0]])
     rule, held = icp_kernels.AgreementRule(0.8, np.inf, 1.0), icp_kernels.PoseEquations(1e20 * np.eye(6), np.zeros(6))
     found = icp_kernels.PoseEquations(H, b)
-    met, agree, cost = icp_kernels.align(T.copy(), source.points, target.points, target.view, still, rule, held, found)
+    met, agree, cost, iterations, _ = icp_kernels.align(T.copy(), source.points, target.points, target.view, still, rule, held, found)
 
     q = se3.transform(T, source.xyz.astype(float))
     fx, fy, cx, cy = target.pinhole
@@ -128,7 +140,7 @@ def test_the_gradient_equals_numerical_derivatives():
     inside = (u >= 0) & (v >= 0) & (u < target.row.shape[1]) & (v < target.row.shape[0])
     i = np.where(inside, target.row[v.clip(0, target.row.shape[0] - 1), u.clip(0, target.row.shape[1] - 1)], -1)
     j = np.flatnonzero(i >= 0)
-    assert met == len(j)
+    assert met == len(j) and iterations == 1
     m = source.normal @ T[:3, :3].T
     close = (np.linalg.norm(q[j] - target.xyz[i[j]], axis=1) <= 0.05) & ((m[j] * target.normal[i[j]]).sum(axis=1) >= 0.8)
     j = j[close]
