@@ -141,13 +141,19 @@ def stage_line(record: Mapping[str, Any], told: Sequence[str]) -> str:
 
 
 def counts(summary: Mapping[str, Any], names: Sequence[str] | None = None) -> list[str]:
-    """Write the numbers and words of a stage's summary as "8609 landmarks"; of those in `names` that are there and not 0, or all."""
+    """Write the numbers, words and counts by name of a stage's summary as "8609 landmarks"; of those in `names` that are there and not 0, or all."""
     found = []
     for name, value in summary.items():
-        if name == "frames" or not isinstance(value, (int, float, str)) or (names is not None and (name not in names or value == 0)):
+        if (
+            name == "frames"
+            or not isinstance(value, (int, float, str, Mapping))
+            or (names is not None and (name not in names or value == 0))
+        ):
             continue
         word = name.replace("_", " ")
-        if isinstance(value, (bool, str)):
+        if isinstance(value, Mapping):
+            found.append(f"{word}: {', '.join(f'{count} {kind}' for kind, count in value.items())}")
+        elif isinstance(value, (bool, str)):
             found.append(f"{word}: {'yes' if value is True else 'no' if value is False else value}")
         else:
             found.append(f"{value:.4g} {word}" if isinstance(value, float) else f"{value} {word}")

@@ -70,6 +70,8 @@ def test_more_of_a_stage_is_told_when_asked_for_and_nothing_when_quiet(capsys: p
     try:
         console.set_up(1)
         assert console.stage_line(record(), TOLD) == "track      1362 frames  14.2 s  95.9 fps  173 key frames  0.5123 rms"
+        by_name = record(summary={"key_frame_reasons": {"new surface": 3, "overdue": 2}})
+        assert console.stage_line(by_name, TOLD) == "track      14.2 s  95.9 fps  key frame reasons: 3 new surface, 2 overdue"
         console.set_up(0, quiet=True)
         console.say("made")
         logging.getLogger("slamcli.test").warning("frame is dark")

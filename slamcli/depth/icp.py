@@ -93,7 +93,7 @@ class Alignment:
     rms: float  # of the residuals in sigma
     depth: float  # [m] mean of the points of j
     iterations: int  # of all passes
-    is_converged: bool  # whether the last pass ended by a step that is short enough, not by its number
+    is_converged: bool  # whether the last pass ended by a step that was short enough, not by the number of its iterations
 
 
 def _blocks(columns: int) -> tuple[int, int, int]:

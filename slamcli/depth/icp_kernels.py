@@ -183,13 +183,13 @@ def align(
     """Move T_ij (4, 4), in place, to where the points of j, the source, agree best with those of i; write H (upper triangle) and b there.
 
     A point of j meets the one of i that `view` shows where it projects to. They agree when they are within reach and their normals are
-    alike. Returns points met, points that agree, sum of w chi2, iterations, whether the last step was short enough to end its pass.
+    alike. Returns points met, points that agree, sum of w chi2, iterations, whether the last pass ended by a step that was short enough.
 
     schedule : (S, 4) rows of every (so many-th point), reach [m], iterations at most, length of a step of the motion that ends them
     known : what is known at the start besides
     """
     A, g, total, xi, L = np.empty((6, 6)), np.empty(6), np.zeros(6), np.empty(6), np.empty((6, 6))
-    s, done, iterations, is_short = 0, 0, 0, True
+    s, done, iterations, is_short = 0, 0, 0, False
     while True:  # one call, so that what it calls is compiled into this kernel once
         now = _Round(1, schedule[s - 1, 1], True) if s == len(schedule) else _Round(int(schedule[s, 0]), schedule[s, 1], False)
         met, agree, cost = _normal_equations(T_ij, source, target, view, now, rule, out)
@@ -197,8 +197,8 @@ def align(
             return met, agree, cost, iterations, is_short
         done += 1
         iterations += 1
-        # One reading weighs 1 / (readings_as_one s^2), and stands for all that this pass leaves out; s^2 = max(cost / n, 0.01) is how much noisier the
-        # depth is than the model says.
+        # One reading weighs 1 / (readings_as_one s^2), and `every` times that, as it stands for those that this pass leaves out.
+        # s^2 = max(cost / n, LEAST_VARIANCE_FACTOR) is how much noisier the depth is than the model says.
         weight = now.every / (rule.readings_as_one * max(cost / max(agree, 1), LEAST_VARIANCE_FACTOR))
         # (weight H + H_prior) xi = weight b + b_prior - H_prior total: the prior is of the start, and so pulls back what was moved since.
         for i in range(6):
@@ -207,11 +207,12 @@ def align(
                 A[i, j] = weight * out.H[min(i, j), max(i, j)] + known.H[i, j]
                 g[i] -= known.H[i, j] * total[j]
         length = 0.0
-        if solve_damped(A, g, 0.0, L, xi):
+        is_solved = solve_damped(A, g, 0.0, L, xi)
+        if is_solved:
             left_update(T_ij, xi)  # T <- exp(xi) T
             for i in range(6):
                 total[i] += xi[i]
                 length += xi[i] * xi[i]
-        is_short = length < schedule[s, 3] ** 2
-        if is_short or done == schedule[s, 2]:
+        is_short = is_solved and length < schedule[s, 3] ** 2
+        if is_short or not is_solved or done == schedule[s, 2]:
             s, done = s + 1, 0

@@ -34,6 +34,7 @@ class RigidMotion:
     T_ba: np.ndarray  # (4, 4) camera a to camera b
     is_inlier: np.ndarray  # (N,) bool
     rms: float  # px, in camera b, of the inliers
+    iterations: int  # of RANSAC
 
 
 @dataclass(frozen=True)
@@ -100,10 +101,10 @@ def ransac_rigid(
     T_ab = np.ascontiguousarray(np.concatenate([R_ab, product(-R_ab, T_ba[:, :, 3:])], axis=2))
     is_inlier = np.zeros(n, dtype=np.bool_)
     there, back = Hypotheses(T_ba, x_a, ray_b), Hypotheses(T_ab, x_b, ray_a)
-    best, _ = kernels.rank(there, back, True, ransac.agreement(camera, 3), is_inlier)
+    best, done = kernels.rank(there, back, True, ransac.agreement(camera, 3), is_inlier)
     if best < 0:
         return None
-    return RigidMotion(_matrix(T_ba[best]), is_inlier, _rms(T_ba[best], x_a, ray_b, camera, is_inlier))
+    return RigidMotion(_matrix(T_ba[best]), is_inlier, _rms(T_ba[best], x_a, ray_b, camera, is_inlier), done)
 
 
 def refine_pose(T_cw: np.ndarray, x_w: np.ndarray, measured: Measurements, camera: Camera, *, loss: Huber = HUBER) -> PoseEstimate:

@@ -43,8 +43,8 @@ def find_alike(sparse_map: SparseMap, places: PlaceIndex, settings: LoopConfig) 
     for i in range(len(sparse_map.kf)):
         scores = places.scores(i)
         shared = sparse_map.votes(sparse_map.landmarks_of(i))
-        # Each vocabulary has its own range of scores: a place seen again should look nearly as alike as the neighbours do, here a share of their
-        # mean score; [ORB-SLAM] takes the least.
+        # Each vocabulary has its own range of scores: a place seen again should score a share of what the neighbours do in the mean.
+        # [ORB-SLAM] takes the least of theirs.
         neighbours = np.flatnonzero(shared >= settings.min_shared)
         neighbours = neighbours[neighbours != i]
         least = (

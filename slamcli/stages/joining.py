@@ -6,6 +6,7 @@ them as they are. What ties them together is left to `loop`.
 """
 
 import json
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -149,10 +150,11 @@ def join_track(parts: Sequence[RecordingPart], inputs: Inputs, out: Path, cfg: C
         for part, at in zip(parts, offset, strict=False)
         for first, last, reason in part.summary["lost_spans"]
     ]
+    reasons = sum((Counter(part.summary["key_frame_reasons"]) for part in parts), Counter[str]())
     shares = [part.summary["share_that_moves"] for part in parts if "share_that_moves" in part.summary]
     return (
         _added(parts)
-        | {"segments": map_segments.n_segments(map_), "lost_spans": spans}
+        | {"segments": map_segments.n_segments(map_), "key_frame_reasons": dict(sorted(reasons.items())), "lost_spans": spans}
         | ({"share_that_moves": float(np.mean(shares))} if shares else {})
     )
 

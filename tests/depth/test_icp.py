@@ -116,6 +116,15 @@ def test_iterations_are_counted_and_end_where_steps_are_short(monkeypatch):
     assert cut_short.iterations == 1 and not cut_short.is_converged
 
 
+def test_equations_that_have_no_solution_are_no_convergence():
+    source, target, T = relief(HERE, 1), relief(HERE, 2), se3.exp(np.array([0.0, 0.0, -50.0, 0.0, 0.0, 0.0]))
+    nothing, found = (icp_kernels.PoseEquations(np.zeros((6, 6)), np.zeros(6)) for _ in range(2))
+    met, _, _, iterations, is_converged = icp_kernels.align(
+        T.copy(), source.points, target.points, target.view, icp.SCHEDULE, icp.RULE, nothing, found
+    )
+    assert met == 0 and iterations == len(icp.SCHEDULE) and not is_converged
+
+
 def test_places_that_differ_do_not_agree():
     there = look_along([5.5, 2.0, 1.0], 0.3, 0.1)
     found = icp.align(np.eye(4), relief(HERE, 1), relief(there, 2))

@@ -91,6 +91,13 @@ def test_each_recording_has_the_bytes_of_a_run_of_it_alone(house: RunDir, room_r
     assert [name for name in alone if alone[name] != inside[name]] == []
 
 
+def test_reasons_for_key_frames_add_up_over_the_recordings(house: RunDir) -> None:
+    summary = (house.record("track") or {})["summary"]
+    parts = [(RunDir(house.recording_path(name)).record("track") or {})["summary"] for name in ("room", "again", "elsewhere")]
+    assert summary["key_frame_reasons"]["begins a segment"] == sum(part["segments"] for part in parts) == 3
+    assert sum(summary["key_frame_reasons"].values()) == sum(part["key_frames"] for part in parts)
+
+
 def test_the_order_in_which_they_are_named_is_not_the_order_in_which_they_are_joined(
     house: RunDir, recordings: dict[str, Path], tmp_path: Path
 ) -> None:
