@@ -353,7 +353,7 @@ def forged(path: Path) -> None:
     run = RunDir.find(str(path.parent if path.name != "stage.json" else path.parents[1]))
     run.states(run.config())
     records = {stage: run.record(stage) for stage in NAMES}
-    doubt.verdict(doubt.from_records(records))
+    doubt.headline(doubt.from_records(records))
     for name, record in records.items():
         if record is not None:
             stage_line(record, stage_named(name).told)

@@ -147,7 +147,7 @@ class Doubt:
     disagreement: np.ndarray = array("f4", "F", "m, between the motion within half a second as track and as loop found it, NaN = unknown")
     sigma: np.ndarray = array("f4", "F", "m, standard deviation of the position beside the frames around, NaN = lost")
     drift: np.ndarray = array("f4", "F", "m, the same beside the best held part of the recording, where things move; else 0")
-    is_doubtful: np.ndarray = array("?", "F", "verdict")
+    is_doubtful: np.ndarray = array("?", "F", "whether the run does not trust the pose")
 
 
 @dataclass(frozen=True)

@@ -151,5 +151,5 @@ def warn_of_doubt(folder: RunDir) -> None:
     from slamcli.slam import doubt
     from slamcli.stages import NAMES
 
-    if said := doubt.verdict(doubt.from_records({name: folder.record(name) for name in NAMES})):
+    if said := doubt.headline(doubt.from_records({name: folder.record(name) for name in NAMES})):
         click.echo(f"Warning: {said}", err=True)

@@ -162,7 +162,7 @@ def _stages(content: Content) -> list[Remark]:
 
 def headline(content: Content) -> str:
     """Sum up in one line, and before that what puts the whole in doubt."""
-    said = doubt.verdict(_doubts(content))
+    said = doubt.headline(_doubts(content))
     return f"{said}. {_located(content)}" if said else _located(content)
 
 

@@ -20,7 +20,7 @@ def outcome(run: RunDir) -> str:
     records = _records(run)
     if len(records) < len(NAMES):
         return ""
-    said = doubt.verdict(doubt.from_records(records))
+    said = doubt.headline(doubt.from_records(records))
     n_warnings = sum(record["n_warnings"] for record in records.values())
     rows = [
         _trajectory(records),

@@ -52,7 +52,7 @@ def from_records(records: Mapping[str, Mapping[str, Any] | None]) -> list[Findin
     return sorted((finding for finding in findings if finding.name not in explained), key=lambda finding: not finding.is_grave)
 
 
-def verdict(findings: Iterable[Finding]) -> str:
+def headline(findings: Iterable[Finding]) -> str:
     """Sum grave findings up in one line, "" where there are none."""
     grave = [finding.text for finding in findings if finding.is_grave]
     return f"DOUBTFUL: {'; '.join(grave)}" if grave else ""

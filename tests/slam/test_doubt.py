@@ -27,8 +27,8 @@ def test_without_findings_a_summary_has_no_word_of_doubt() -> None:
 
 
 def test_only_grave_findings_put_the_whole_in_doubt() -> None:
-    assert doubt.verdict([MILD]) == ""
-    said = doubt.verdict([MILD, GRAVE])
+    assert doubt.headline([MILD]) == ""
+    said = doubt.headline([MILD, GRAVE])
     assert GRAVE.text in said and MILD.text not in said and "\n" not in said
 
 
