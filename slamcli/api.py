@@ -22,6 +22,7 @@ from slamcli.config.options import Config
 from slamcli.config.toml import Settings
 from slamcli.console import Progress, Tell, silent
 from slamcli.errors import SlamError
+from slamcli.hints import hint
 from slamcli.runs.creation import create_run, open_target, writing
 from slamcli.runs.run_directory import RunDir
 from slamcli.runs.several import extend, pipeline
@@ -305,7 +306,7 @@ def _registered(
     camera = _told_by_map(camera, dataset, config)
     registered = replace(config, recording=replace(config.recording, depth_camera=camera.option))
     opened, dataset, _ = reopen(resolve=lambda config: registered)
-    told = f"{camera.told}; -s recording.find_depth_camera=false leaves depth as it is"
+    told = f"{camera.told}; {hint().setting('recording.find_depth_camera', 'false')} leaves depth as it is"
     log.warning("%s: %s", dataset.root, told)
     others = [finding for finding in found if finding.name != "registration"]
     return opened, dataset, registered, [*others, Finding("depth_camera", told)]

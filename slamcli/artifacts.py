@@ -13,6 +13,7 @@ import numpy as np
 
 from slamcli import files, mapped_memory
 from slamcli.errors import SlamError
+from slamcli.hints import hint
 
 Record = TypeVar("Record")
 
@@ -176,7 +177,7 @@ def load(cls: type[Record], folder: Path) -> Record:
         value = cls(**{spec.name: _read(Path(folder) / f"{spec.name}.npy") for spec in fields(cls)})  # type: ignore[arg-type]  # mypy has no name for what is a dataclass
         check(value)
     except ValueError as error:
-        raise SlamError(f"{folder}: not what this version of slamcli writes ({error}); make it anew with: slamcli run --force") from error
+        raise SlamError(f"{folder}: not what this version of slamcli writes ({error}); make it anew with: {hint().force()}") from error
     return value
 
 

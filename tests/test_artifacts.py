@@ -131,7 +131,7 @@ def test_a_damaged_or_hostile_file_gives_one_line_that_names_it(tmp_path: Path, 
     artifacts.save(ragged(), tmp_path)
     path = tmp_path / "depth.npy"
     path.write_bytes(hostile(kind, path.read_bytes()))
-    with pytest.raises(SlamError, match=r"depth.*slamcli run --force$") as caught:
+    with pytest.raises(SlamError, match=r"depth.*run.update\(force=True\)$") as caught:
         artifacts.load(Ragged, tmp_path)
     assert "\n" not in str(caught.value)
 

@@ -1,4 +1,4 @@
-"""The rules of import, of what a compiled kernel may call, and of size. Read from the source text: nothing is imported for it."""
+"""The rules of import, of what a compiled kernel may call, of what a library may say, and of size. All are read from the source text."""
 
 import ast
 import re
@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 import slamcli
+from slamcli.cli.main import cli
 
 PACKAGE = Path(slamcli.__file__).parent
 MODULES = sorted(PACKAGE.rglob("*.py"))
@@ -17,7 +18,7 @@ MODULES = sorted(PACKAGE.rglob("*.py"))
 # The layers from the ground up. A file imports only from lower layers, and from its own package; packages of one layer do not know
 # each other. Files in the root count as packages of their own.
 LAYERS = (
-    ("errors", "data"),
+    ("errors", "data", "hints"),
     ("__init__", "user_cache"),
     ("files", "interruption", "address_space"),
     ("mapped_memory",),
@@ -47,7 +48,14 @@ CLICK = ("cli",)
 # Packages of pure numerics: they open no file, and their errors are for a notebook as much as for the command line.
 NUMERICAL = ("geometry", "vision", "depth", "estimation", "sparse_map", "dense", "navigation", "calibration", "slam")
 FILES = ("slamcli.files", "pathlib", "io", "os", "shutil", "tempfile", "zipfile")
-COMMAND_LINE = re.compile(r"slamcli [a-z]|(^|\s)--?[a-z]")
+# Packages of the program itself, and what speaks for it. All others are called from Python too: they advise by hint().
+OF_THE_PROGRAM = ("cli", "__main__", "hints")
+FLAG = r"(^|[\s(\"'`])--?[a-z]"
+OF_OTHER_PROGRAMS = re.compile(r"(ulimit|pip install|rtabmap) --?[a-z-]+|gs --?[a-z]+")
+NO_ADVICE = {  # words for other programs
+    "batch/cluster.py": [" --nthreads 1"],
+    "jit/compilation.py": ["-c"],
+}
 OPEN3D = ("open3d_loader.py",)
 EVO = ("evaluation/trajectory_error.py",)
 
@@ -114,19 +122,32 @@ def test_heavy_and_interactive_packages_stay_where_they_belong(path: Path) -> No
 
 
 @pytest.mark.parametrize("path", [path for path in MODULES if package_of(path) in NUMERICAL], ids=name_of)
-def test_numerical_packages_open_no_file_and_speak_no_command_line(path: Path) -> None:
+def test_numerical_packages_open_no_file(path: Path) -> None:
     tree = parsed(path)
     opened = {name for name, _ in imports(tree) if name in FILES}
     assert not opened, f"{name_of(path)} imports {sorted(opened)}: files belong to formats/, datasets/ and stages/"
     assert not any(isinstance(node, ast.Call) and ast.unparse(node.func) == "open" for node in ast.walk(tree))
-    said = {
-        node.value
-        for raised in ast.walk(tree)
-        if isinstance(raised, ast.Raise | ast.Return)
-        for node in ast.walk(raised)
-        if isinstance(node, ast.Constant) and isinstance(node.value, str)
+
+
+def texts(tree: ast.Module) -> Iterator[str]:
+    """Return every text of a file that is no docstring: what a message is made of, whichever way it takes to whom it is for."""
+    with_docstring = ast.Module | ast.ClassDef | ast.FunctionDef
+    docstrings = {
+        id(node.body[0].value)
+        for node in ast.walk(tree)
+        if isinstance(node, with_docstring) and node.body and isinstance(node.body[0], ast.Expr)
     }
-    assert not {text for text in said if COMMAND_LINE.search(text)}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in docstrings:
+            yield node.value
+
+
+@pytest.mark.parametrize("path", [path for path in MODULES if package_of(path) not in OF_THE_PROGRAM], ids=name_of)
+def test_a_library_leaves_commands_and_flags_to_the_program(path: Path) -> None:
+    """Whoever calls it from Python has none: what is advised goes through slamcli/hints.py, which knows both ways of saying it."""
+    command_line = re.compile(rf"slamcli ({'|'.join(cli.commands)})\b|{FLAG}")
+    said = [OF_OTHER_PROGRAMS.sub("", text) for text in texts(parsed(path)) if text not in NO_ADVICE.get(name_of(path), [])]
+    assert not [text for text in said if command_line.search(text)]
 
 
 def is_kernel(function: ast.FunctionDef) -> bool:

@@ -11,6 +11,7 @@ from slamcli.batch import storage, worker
 from slamcli.batch.jobs import Job
 from slamcli.console import Progress, Tell, silent
 from slamcli.errors import SlamError
+from slamcli.hints import hint
 from slamcli.jit import compilation
 from slamcli.runs.pipeline import environment
 
@@ -52,7 +53,7 @@ def local(workers: int, memory: int, *, progress: Progress = silent, tell: Tell 
             client = stack.enter_context(Client(cluster))
         except (RuntimeError, TimeoutError) as error:  # what Dask says where a process does not come up in time
             raise SlamError(
-                f"the workers do not start ({_first_line(error)}): the machine is too busy or short of memory; start fewer with --workers"
+                f"the workers do not start ({_first_line(error)}): the machine is too busy or short of memory; start fewer with {hint().argument('workers')}"
             ) from error
         yield client
 
@@ -131,7 +132,8 @@ def _row(job: Job, end: "Future") -> dict[str, Any]:
     error = end.exception()
     reason = _first_line(error)
     if type(error).__name__ == "KilledWorker":  # by the system, for want of memory, or by its nanny for the same
-        reason = "every worker that tried it died, perhaps for want of memory; give workers more, or start fewer with --workers"
+        few = hint().argument("workers")
+        reason = f"every worker that tried it died, perhaps for want of memory; give workers more, or start fewer with {few}"
     return {"recording": job.recording, "run": job.run, "state": "failed", "reason": reason}
 
 

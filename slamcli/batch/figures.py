@@ -99,7 +99,7 @@ def as_page(rows: Sequence[Row]) -> str:
     head = "".join(f"<th{_class(name)}>{html.escape(COLUMNS[name][0])}</th>" for name in COLUMNS)
     body = "".join(_line(row) for row in sorted(rows, key=lambda row: (row["state"] != "failed", not row.get("doubt"))))
     return (
-        f'<!DOCTYPE html><html lang="en"><head><meta charset="utf-8"><title>slamcli batch: {title}</title><style>{STYLE}</style></head>'
+        f'<!DOCTYPE html><html lang="en"><head><meta charset="utf-8"><title>{title}</title><style>{STYLE}</style></head>'
         f"<body><h1>{title}</h1><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody><tfoot>{_total(rows)}</tfoot></table>"
         f"<p>slamcli {__version__}</p></body></html>\n"
     )

@@ -9,13 +9,14 @@ import uuid
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from slamcli import files
 from slamcli.batch import storage
 from slamcli.config.options import Config
 from slamcli.errors import SlamError
+from slamcli.hints import Hints, hint
 from slamcli.stages import NAMES
 
 LIST_SUFFIX = ".txt"
@@ -33,6 +34,7 @@ class Order:
     until: str = NAMES[-1]  # the last stage
     threads: int = 1  # of a stage
     marker: str = ""  # name of a file in `out` by which a worker knows that it sees the same folder; "" for a URL
+    hints: type[Hints] = field(default_factory=lambda: type(hint()))  # in whose words workers advise: those of who gives the order
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ from slamcli.config import toml
 from slamcli.config.options import Config
 from slamcli.datasets import Dataset, open_dataset
 from slamcli.errors import SlamError
+from slamcli.hints import spoken
 from slamcli.jit import compilation
 from slamcli.parallel import one_thread_in_blas
 from slamcli.runs import source_code
@@ -69,7 +70,7 @@ def run_stage(job: Job, stage: str, before: Done | None, client: dict[str, Any],
     if before is not None and before.failure:
         return before
     _check(client)
-    with _ONE_AT_A_TIME:
+    with _ONE_AT_A_TIME, spoken(job.order.hints()):
         try:
             return Desk(job).run_stage(stage, parts)
         except SlamError as error:
@@ -96,7 +97,7 @@ def finish(job: Job, last: Done) -> dict[str, Any]:
     from slamcli.batch import figures
 
     row = {"recording": job.recording, "run": job.run, "state": "failed" if last.failure else "done", "reason": last.failure}
-    with _ONE_AT_A_TIME:
+    with _ONE_AT_A_TIME, spoken(job.order.hints()):
         desk = Desk(job)
         try:
             if not last.failure:

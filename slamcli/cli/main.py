@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from slamcli import __version__, files, interruption
+from slamcli import __version__, files, hints, interruption
 from slamcli.cli.common import verbose_option
 from slamcli.errors import SlamError
 
@@ -45,7 +45,7 @@ class Group(click.Group):
     def invoke(self, ctx: click.Context) -> Any:
         """Run the command. Status 1: the user can mend it; 130: interrupted, 143: terminated. The rest is a bug and keeps its traceback."""
         try:
-            with interruption.raising():
+            with interruption.raising(), hints.spoken(hints.ShellHints()):
                 return super().invoke(ctx)
         except SlamError as error:
             raise click.ClickException(str(error)) from error

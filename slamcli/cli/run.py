@@ -2,11 +2,13 @@
 
 import json
 import os
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from slamcli.cli.common import complete_run, complete_target, config_option, json_option, recording_options, run_option, set_option
+from slamcli.hints import hint, run_flag
 from slamcli.stages import NAMES, STAGES, Stage
 
 if TYPE_CHECKING:
@@ -132,7 +134,7 @@ def _tell_made(rundir: "RunDir") -> None:
         for finding in verdict.findings:
             console.say(console.amber(f"{'problem' if finding.is_grave else 'note':<10}  {finding.message}"))
             console.say(console.amber(f"{'':<10}  -> {finding.remedy}"))
-    console.say("next: " + "\n      ".join(summary.next_commands(rundir, is_usable=verdict is None or verdict.is_usable)))
+    console.say("next: " + "\n      ".join(_next_commands(rundir, is_usable=verdict is None or verdict.is_usable)))
 
 
 def _place_and_verdict(rundir: "RunDir") -> "tuple[Placement | None, Verdict | None]":
@@ -156,8 +158,25 @@ def _made_object(rundir: "RunDir") -> dict[str, Any]:
     return summary.to_dict(rundir) | {
         "frames": where.to_dict() if where is not None else None,
         "map": verdict.to_dict() if verdict is not None else None,
-        "next": summary.next_commands(rundir, is_usable=verdict is None or verdict.is_usable),
+        "next": _next_commands(rundir, is_usable=verdict is None or verdict.is_usable),
     }
+
+
+def _next_commands(rundir: "RunDir", *, is_usable: bool) -> list[str]:
+    """List the commands that come next for this run, each to be pasted as it is; none for a robot where no floor is free.
+
+    is_usable : whether a robot could use the map, by its verdict
+    """
+    roots = [entry["root"] for entry in rundir.recordings] or [rundir.info()["root"]]
+    has_truth = any((Path(root) / "groundtruth.txt").is_file() for root in roots)
+    has_floor = (rundir.record("grid2d") or {"summary": {}})["summary"].get("free", 0) > 0
+    which = run_flag(rundir.path)
+    return [
+        *([f"slamcli eval ape {which}"] if has_truth else []),
+        f"slamcli report {which}",
+        *([f"slamcli export-grid map.pgm --png map.png {which}"] if has_floor else []),
+        *([f"slamcli plan --start first --reachable {which}"] if has_floor and is_usable else []),
+    ]
 
 
 def _look(dataset: "Dataset") -> "list[doubt.Finding]":
@@ -187,7 +206,7 @@ def _stage_command(stage: Stage) -> click.Command:
         made = ((name, state) for name, state in done.status().items() if state.state != staleness.MISSING)
         behind = [name for name, state in made if not state.is_fresh and not done.directory.is_cleaned(state)]
         if behind:
-            console.say(f"not up to date now: {', '.join(behind)}; make them anew with: slamcli run {done.directory.flag}")
+            console.say(f"not up to date now: {', '.join(behind)}; make them anew with: {hint().update(done.path)}")
 
     return command
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from slamcli.cli.common import Target, check_ending, json_option, run_option
+from slamcli.hints import run_flag
 
 if TYPE_CHECKING:
     from slamcli.runs.housekeeping import Listed
@@ -65,7 +66,7 @@ def clean_command(run: str | None, keep: str, as_json: bool) -> None:
 
     folder = RunDir.find(run)
     if run is None and "SLAMCLI_RUN" not in os.environ:
-        raise click.UsageError(f"say whose files are to be deleted; the run made last is that of: {folder.flag}")
+        raise click.UsageError(f"say whose files are to be deleted; the run made last is that of: {run_flag(folder.path)}")
     freed = housekeeping.clean(folder)
     if as_json:
         click.echo(json.dumps({"run": str(folder.path), "kept": keep, "freed": freed}))

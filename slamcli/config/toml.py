@@ -12,6 +12,7 @@ from slamcli import files
 from slamcli.config import ranges
 from slamcli.config.options import Config
 from slamcli.errors import SlamError
+from slamcli.hints import hint
 
 Settings = Mapping[str, Any] | Iterable[str]  # values by full name, or the texts that follow -s
 
@@ -87,18 +88,19 @@ def apply(base: Config, assignments: Iterable[str]) -> Config:
     for assignment in assignments:
         key, equals, text = (part.strip() for part in assignment.partition("="))
         if not equals or not key:
-            raise SlamError(f"-s {assignment}: write -s section.key=value, such as -s track.min_inliers=20")
+            given = hint().argument("settings")
+            raise SlamError(f"{given} {assignment}: write {given} section.key=value, such as track.min_inliers=20")
         values: Any = _parse(text)
         for part in reversed(key.split(".", 1)):
             values = {part: values}
         shown = assignment if len(assignment) <= LONGEST_SHOWN else f"{assignment[:LONGEST_SHOWN]}..."
-        base = merge(base, values, source=f"-s {shown}")
+        base = merge(base, values, source=f"{hint().argument('settings')} {shown}")
     return base
 
 
 def _parse(text: str) -> Any:
     try:
-        parsed = files.parse_toml(f"value = {text}".encode(errors="replace"), source="-s")
+        parsed = files.parse_toml(f"value = {text}".encode(errors="replace"), source=text)
     except SlamError:
         return text
     return parsed["value"] if len(parsed) == 1 else text
@@ -157,8 +159,8 @@ def _unknown(key: str, source: str) -> SlamError:
     if "." in key:
         near = difflib.get_close_matches(key, near, n=1, cutoff=0.0)
     near = near or difflib.get_close_matches(key, known, n=1, cutoff=0.6)
-    hint = f"did you mean {' or '.join(near)}?" if near else "see: slamcli config --explain"
-    return SlamError(f"{source}: {key[:LONGEST_SHOWN]} is not known; {hint}")
+    advice = f"did you mean {' or '.join(near)}?" if near else f"see: {hint().options()}"
+    return SlamError(f"{source}: {key[:LONGEST_SHOWN]} is not known; {advice}")
 
 
 def _camera_value(key: str, value: Any, source: str) -> float | str:
@@ -193,7 +195,7 @@ def _value(section: type, section_name: str, key: str, value: Any, source: str) 
 
 
 def _origin(name: str, value: Any, source: str) -> str:
-    if source.startswith("-s "):
+    if source.startswith(f"{hint().argument('settings')} "):  # an assignment, which says it all
         return source
     try:
         shown = _toml(value)

@@ -12,6 +12,7 @@ from slamcli.datasets.protocol import Dataset
 from slamcli.datasets.readers import READERS, reader_of
 from slamcli.errors import SlamError
 from slamcli.files import user_path
+from slamcli.hints import hint
 from slamcli.user_cache import user_cache
 
 __all__ = ["READERS", "Dataset", "open_dataset", "silent"]
@@ -54,12 +55,12 @@ def _not_a_recording(path: Path) -> str:
     if path.suffix.lower() in ARCHIVES:
         return f"{path}: an archive; unpack it and give the folder of the recording"
     if path.is_file():
-        return f"{path}: not a recording; give the folder of one, or a file of a kind that opens (see: slamcli formats)"
+        return f"{path}: not a recording; give the folder of one, or a file of a kind that opens (see: {hint().layouts()})"
     if not path.is_dir():
-        return f"{path}: a device or a pipe; give the folder of a recording, or a file of a kind that opens (see: slamcli formats)"
+        return f"{path}: a device or a pipe; give the folder of a recording, or a file of a kind that opens (see: {hint().layouts()})"
     inner = [entry.name for entry in sorted(path.iterdir()) if entry.is_dir() and reader_of(entry) is not None]
-    hint = f"; recordings are in it: {', '.join(inner[:3])}" if inner else ""
-    return f"{path}: not a recording{hint}; see what opens and how it is told: slamcli formats"
+    found = f"; recordings are in it: {', '.join(inner[:3])}" if inner else ""
+    return f"{path}: not a recording{found}; see what opens and how it is told: {hint().layouts()}"
 
 
 def _locate(target: str, data: str | None, progress: Progress) -> tuple[Path, str]:
@@ -90,7 +91,7 @@ def _locate(target: str, data: str | None, progress: Progress) -> tuple[Path, st
 
 def _data_roots(data: str | None) -> list[Path]:
     if data is not None and not user_path(data).is_dir():
-        raise SlamError(f"--data {data}: no such folder")
+        raise SlamError(f"{hint().argument('data')} {data}: no such folder")
     given = [data, os.environ.get("SLAMCLI_DATA"), "data"]
     return [user_path(root) for root in given if root] + [user_cache() / "datasets"]
 

@@ -11,6 +11,7 @@ from slamcli.datasets.cameras import FREIBURG, NOMINAL, freiburg_number, nominal
 from slamcli.datasets.intrinsics import read_camera_file, read_intrinsics
 from slamcli.errors import SlamError
 from slamcli.geometry.camera import SHAPE_TOLERANCE, Camera
+from slamcli.hints import hint
 
 CAMERA_FILES = ("camera.toml", "camera.json")
 # Files that hold intrinsics in public layouts and recorders, the most telling first.
@@ -113,7 +114,7 @@ def complete(
         what = f"{root}: no calibration" if not calibration.source else f"{told}: the calibration is not whole"
         raise SlamError(
             f"{what}: {', '.join(missing)} {'are' if len(missing) > 1 else 'is'} missing; put them into a camera.toml {_place(root)}, or name the "
-            f"camera: --camera {'|'.join(NOMINAL)}; a run takes -s camera.{missing[0]}=... and so on, too"
+            f"camera: {hint().option('recording.known_camera')} {'|'.join(NOMINAL)}; a run takes {hint().setting(f'camera.{missing[0]}')} and so on, too"
         )
     if depth_scale is not None:
         values.setdefault("depth_scale", depth_scale)

@@ -5,6 +5,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from slamcli.hints import hint
+
 ASSUMED_RATE = 30.0  # [Hz] of recordings without a clock
 UNITS = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}  # of each in a second: a quotient of exact numbers is rounded once
 EPOCH = (5e8, 4.3e9)  # [s] since 1970 of any recording: 1985 to 2106
@@ -106,15 +108,18 @@ def _ordered(seconds: np.ndarray, per_second: float, what: str, told: list[str])
 def _assumed(n: int, fps: float | None, why: str) -> Clock:
     """Keep the list's order at a rate."""
     rate = fps or ASSUMED_RATE
-    said = f"{rate:g} Hz as --fps says" if fps else f"{rate:g} Hz assumed (--fps gives another rate)"
-    return Clock(np.arange(n) / rate, np.arange(n), False, None, [f"{why}; {said}, in the list's order"])
+    return Clock(np.arange(n) / rate, np.arange(n), False, None, [f"{why}; {_rate_told(rate, fps)}, in the list's order"])
+
+
+def _rate_told(rate: float, fps: float | None) -> str:
+    option = hint().option("recording.fps")
+    return f"{rate:g} Hz as {option} says" if fps else f"{rate:g} Hz assumed ({option} gives another rate)"
 
 
 def _numbers(raw: np.ndarray, what: str, fps: float | None) -> Clock:
     rate = fps or ASSUMED_RATE
     found = _ordered(raw / rate, 1.0, what, [])
-    said = f"{rate:g} Hz as --fps says" if fps else f"{rate:g} Hz assumed (--fps gives another rate)"
-    warnings = [*found.warnings, f"{what}: stamps are frame numbers; {said}"]
+    warnings = [*found.warnings, f"{what}: stamps are frame numbers; {_rate_told(rate, fps)}"]
     return Clock(found.stamp, found.row, False, lambda other: np.asarray(other) / rate, warnings)
 
 

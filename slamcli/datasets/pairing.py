@@ -14,6 +14,7 @@ from slamcli.datasets.recorded import Recorded, Stream
 from slamcli.datasets.recording import spread
 from slamcli.datasets.sources import Images
 from slamcli.errors import BadFrame, SlamError
+from slamcli.hints import hint
 
 LOOKED_AT = 5  # images that are compared with the one before
 
@@ -34,7 +35,7 @@ def pair(found: Recorded, fps: float | None) -> Pairs:
     clock = _clock(colour, str(found.root), fps, is_paired=found.is_paired)
     warnings = list(clock.warnings)
     if fps and clock.is_clock:
-        warnings.append(f"{found.root}: --fps {fps:g} is not used, as the recording has time stamps")
+        warnings.append(f"{found.root}: {hint().option('recording.fps')} {fps:g} is not used, as the recording has time stamps")
     if len(colour) == 0:
         raise SlamError(f"{found.root}: holds no colour image")
     if found.is_paired:

@@ -12,6 +12,7 @@ from slamcli.evaluation import map_verdict, of_several, trajectory_error
 from slamcli.evaluation.map_verdict import Verdict
 from slamcli.evaluation.trajectory_error import Ape
 from slamcli.geometry import se3
+from slamcli.hints import hint
 from slamcli.runs import placement
 from slamcli.runs.run_directory import RunDir
 from slamcli.runs.staleness import State
@@ -32,7 +33,7 @@ class Content:
     """A run as the page shows it. `F` frames; poses in the level frame, z up."""
 
     name: str
-    flag: str  # -r and the run's folder, for hints
+    update: str  # what brings the run up to date, as a hint
     stage: str  # whose trajectory is shown
     stamp: np.ndarray  # (F,) [s]
     T_lc: np.ndarray  # (F, 4, 4), NaN = lost
@@ -101,7 +102,7 @@ def collect(run: RunDir, dataset: Dataset | None = None) -> Content:
     states = run.states()
     return Content(
         name=str(run.info()["dataset"]),
-        flag=run.flag,
+        update=hint().update(run.path),
         stage=stage,
         stamp=np.array(times.stamp),
         T_lc=T_lc,

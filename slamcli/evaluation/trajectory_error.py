@@ -16,6 +16,7 @@ import numpy as np
 from slamcli.datasets.association import MAX_DIFFERENCE, associate
 from slamcli.errors import SlamError
 from slamcli.geometry import se3
+from slamcli.hints import hint
 from slamcli.schema import Doubt, FrameTimes, Map, Tracks, Trajectory, trajectory
 from slamcli.stages import WITH_TRAJECTORY
 
@@ -114,7 +115,7 @@ def last_stage(run: Any) -> str:
     for stage in reversed(WITH_TRAJECTORY):
         if run.record(stage) is not None:
             return stage
-    raise SlamError(f"{run.path}: no stage has made a trajectory yet; try: slamcli run --until track {run.flag}")
+    raise SlamError(f"{run.path}: no stage has made a trajectory yet; try: {hint().update(run.path, until='track')}")
 
 
 def stage_trajectory(run: Any, stage: str) -> Trajectory:
@@ -151,7 +152,7 @@ def ground_truth(run: Any) -> Trajectory:
     if truth is None:
         raise SlamError(
             f"{dataset.root}: no ground truth, so there is nothing to compare with; "
-            f"put a groundtruth.txt (timestamp tx ty tz qx qy qz qw) there, give one with --truth, or look at the result with: slamcli report {run.flag}"
+            f"put a groundtruth.txt (timestamp tx ty tz qx qy qz qw) there, give one with {hint().argument('truth')}, or look at the result with: {hint().report(run.path)}"
         )
     return truth
 
@@ -159,7 +160,7 @@ def ground_truth(run: Any) -> Trajectory:
 def matched_pair(estimate: Trajectory, truth: Trajectory, *, name: str) -> tuple[Trajectory, Trajectory]:
     """Reduce both trajectories to the poses they share in time; SlamError when these are too few to align."""
     if len(estimate.stamp) < 3:
-        raise SlamError(f"{name}: {len(estimate.stamp)} poses are too few to align, at least 3 are needed; see: slamcli status")
+        raise SlamError(f"{name}: {len(estimate.stamp)} poses are too few to align, at least 3 are needed")
     rows = associate(estimate.stamp, truth.stamp)
     if len(rows) < 3:
         raise SlamError(

@@ -8,6 +8,7 @@ import numpy as np
 
 from slamcli import files
 from slamcli.errors import SlamError
+from slamcli.hints import hint
 from slamcli.vision.vocabulary import MAX_NODES, Vocabulary, check
 
 FORMAT = 1
@@ -30,7 +31,7 @@ def read(path: str | Path = "") -> Vocabulary:
     try:
         found = path.stat()
     except OSError as error:
-        raise SlamError(f"{path}: the vocabulary cannot be read ({error.strerror}); make one with: slamcli vocab train") from error
+        raise SlamError(f"{path}: the vocabulary cannot be read ({error.strerror}); make one with: {hint().train_vocabulary()}") from error
     return _read(path, found.st_mtime_ns, found.st_size)
 
 
@@ -40,16 +41,20 @@ def _read(path: Path, _mtime_ns: int, _size: int) -> Vocabulary:
     try:
         columns = _read_arrays(path)
     except OSError as error:
-        raise SlamError(f"{path}: the vocabulary cannot be read ({error.strerror or error}); make one with: slamcli vocab train") from error
+        raise SlamError(
+            f"{path}: the vocabulary cannot be read ({error.strerror or error}); make one with: {hint().train_vocabulary()}"
+        ) from error
     except SlamError:
         raise
     except Exception as error:  # what zipfile, its decompressors and numpy's header raise is not declared anywhere
-        raise SlamError(f"{path}: not a vocabulary of slamcli ({error}); text files of DBoW2 come in by: slamcli vocab import") from error
+        raise SlamError(
+            f"{path}: not a vocabulary of slamcli ({error}); text files of DBoW2 come in by: {hint().import_vocabulary()}"
+        ) from error
     vocabulary = Vocabulary(columns["centre"], columns["first_child"], columns["idf"], columns["origin"].tobytes().decode(errors="replace"))
     try:
         return check(vocabulary, source=str(path))
     except SlamError as error:
-        raise SlamError(f"{error}; make one with: slamcli vocab train") from error
+        raise SlamError(f"{error}; make one with: {hint().train_vocabulary()}") from error
 
 
 def _read_arrays(path: Path) -> dict[str, np.ndarray]:

@@ -6,6 +6,7 @@ from pathlib import Path
 from slamcli import files
 from slamcli.errors import SlamError
 from slamcli.evaluation import run_content
+from slamcli.hints import hint
 from slamcli.report import page, pictures
 from slamcli.runs.run_directory import RunDir
 
@@ -22,4 +23,4 @@ def make(run: RunDir, out: Path, *, inspected: Sequence[tuple[str, str]] = ()) -
     try:
         files.write_text(out, text)
     except OSError as error:
-        raise SlamError(f"{out}: cannot be written ({error.strerror}); choose another place with -o") from error
+        raise SlamError(f"{out}: cannot be written ({error.strerror}); choose another place: {hint().report(run.path, 'PAGE')}") from error

@@ -138,7 +138,7 @@ def _stages(content: Content) -> list[Remark]:
         if stage in content.cleaned:
             gone += [stage] * (state.state == MISSING)
         elif state.state == MISSING:
-            found.append(Remark(NOTE, f"{stage} has not been run; go on with: slamcli run {content.flag}"))
+            found.append(Remark(NOTE, f"{stage} has not been run; go on with: {content.update}"))
         elif not state.is_fresh:
             unfit.append(state)
         warnings = [
@@ -152,11 +152,11 @@ def _stages(content: Content) -> list[Remark]:
             found.append(Remark(NOTE, f"{stage}: {total} warnings in all; they are in log.txt"))
     if gone:
         told = f"{', '.join(gone)} {'was' if len(gone) == 1 else 'were'} cleaned away"
-        found.append(Remark(NOTE, f"{told}: what rests on them is left out here; all is made anew with: slamcli run {content.flag}"))
+        found.append(Remark(NOTE, f"{told}: what rests on them is left out here; all is made anew with: {content.update}"))
     if unfit:
         told = f"{unfit[0].stage} is {unfit[0].state} ({unfit[0].reason})"
         rest = f", and so {'is' if len(unfit) == 2 else 'are'} {', '.join(state.stage for state in unfit[1:])}" if len(unfit) > 1 else ""
-        found.append(Remark(BAD, f"{told}{rest}; bring up to date with: slamcli run {content.flag}"))
+        found.append(Remark(BAD, f"{told}{rest}; bring up to date with: {content.update}"))
     return found
 
 

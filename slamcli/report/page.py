@@ -62,7 +62,7 @@ def render(content: Content, pictures: list[Picture], inspected: Sequence[tuple[
     return fill(
         "page.html",
         name=content.name,
-        flag=content.flag,
+        update=content.update,
         headline=doubts.headline(content),
         cards=_cards(content),
         remarks=doubts.remarks(content, inspected),

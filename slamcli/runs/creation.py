@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from slamcli.config.options import Config
 from slamcli.console import Progress, log_file, silent
 from slamcli.errors import SlamError
+from slamcli.hints import hint
 from slamcli.runs.places import default_path
 from slamcli.runs.run_directory import RunDir
 from slamcli.runs.several import entries, joined
@@ -37,7 +38,8 @@ def create_run(
         raise SlamError("no recording named; give a folder, tum/fr1_room or demo")
     if len(targets) > 1 and path is None:
         raise SlamError(
-            "several recordings make one map, whose run needs a name, such as -r runs/house; for a run of each: slamcli batch RECORDING..."
+            f"several recordings make one map, whose run needs a name, such as {hint().argument('path')} runs/house; "
+            f"for a run of each: {hint().each_alone()}"
         )
 
     def open_all(config: Config) -> "list[Dataset]":

@@ -12,8 +12,8 @@ from slamcli.config import toml
 from slamcli.config.options import Config
 from slamcli.errors import Damaged, SlamError
 from slamcli.files import read_bytes, sha256, write_bytes
+from slamcli.hints import hint
 
-OTHER_VERSION = " (another version of slamcli made this run; start another one with -r)"
 Records = Mapping[str, Mapping[str, Any]]  # stage.json by stage
 
 SEAL = "# sealed "  # begins the last line of config.toml; the digest of all above it follows
@@ -94,13 +94,17 @@ def _sealed_config(data: bytes, source: str) -> Config:
     text = data[: data.rfind(SEAL.encode())] if SEAL.encode() in data else b""
     if text + seal(text) != data:
         raise Damaged(
-            f"{source}: not as slamcli wrote it; slamcli run restores it from what the stages recorded, "
-            "or takes your changes with -s section.key=value or --config FILE"
+            f"{source}: not as slamcli wrote it; restore it from what the stages recorded with: {hint().repair(Path(source).parent)}; "
+            f"give your changes with {hint().argument('settings')} or {hint().argument('config')}"
         )
     try:
         return toml.parse(text, source=source)
     except SlamError as error:  # it is whole, so that it is not the user's slip
-        raise SlamError(f"{error}{OTHER_VERSION}") from error
+        raise _of_another_version(error) from error
+
+
+def _of_another_version(error: SlamError) -> SlamError:
+    return SlamError(f"{error} (another version of slamcli made this run; start another one with {hint().argument('path')})")
 
 
 def seal(text: bytes) -> bytes:
@@ -115,7 +119,7 @@ def restored_config(records: Records) -> Config:
         try:
             config = toml.merge(config, record["config"], source=f"{stage}/stage.json")
         except SlamError as error:
-            raise SlamError(f"{error}{OTHER_VERSION}") from error
+            raise _of_another_version(error) from error
     return config
 
 

@@ -10,6 +10,7 @@ from typing import Any
 
 from slamcli import files
 from slamcli.errors import Damaged, SlamError
+from slamcli.hints import hint
 from slamcli.runs.places import LATEST, RECORDINGS, RUNS
 from slamcli.runs.run_directory import RunDir
 from slamcli.stages import INTERMEDIATE, NAMES
@@ -95,7 +96,7 @@ def clean(run: RunDir) -> dict[str, int]:
     Raises SlamError where loop has not been run: nothing would be left of the run.
     """
     if run.record("loop") is None:
-        raise SlamError(f"{run.path}: loop has not been run, so there are no results to keep; finish it with: slamcli run {run.flag}")
+        raise SlamError(f"{run.path}: loop has not been run, so there are no results to keep; finish it with: {hint().update(run.path)}")
     freed = {}
     with run.lock():
         for stage in NO_RESULTS:
@@ -123,7 +124,9 @@ def archive(run: RunDir, out: Path, *, skip: Sequence[str] = (), overwrite: bool
     lost = _stages_in(out) - {path.relative_to(run.path).parts[0] for path in chosen}
     if lost and not overwrite:
         there = ", ".join(name for name in NAMES if name in lost)
-        raise SlamError(f"{out}: holds {there}, which the new archive would lack; choose another name, or say --overwrite")
+        raise SlamError(
+            f"{out}: holds {there}, which the new archive would lack; choose another name, or say {hint().argument('overwrite')}"
+        )
     with files.whole(out) as file, zipfile.ZipFile(file, "w", compression=zipfile.ZIP_DEFLATED) as packed:
         for path in chosen:
             entry = zipfile.ZipInfo(f"{run.path.resolve().name}/{path.relative_to(run.path).as_posix()}", date_time=EARLIEST)
@@ -149,10 +152,10 @@ def _stages_in(archive: Path) -> set[str]:
 def _check_intact(run: RunDir, skip: Sequence[str]) -> None:
     run.config()
     if damaged := run.damaged_figures():
-        raise Damaged(f"{run.path / damaged[0]}: it is damaged; remove it with: slamcli run {run.flag}")
+        raise Damaged(f"{run.path / damaged[0]}: it is damaged; remove it with: {hint().repair(run.path)}")
     for stage in NAMES:
         if stage not in skip and (found := run.damage(stage, verify=True)):
-            raise Damaged(f"{run.path}/{found}: it is damaged; repair it with: slamcli run {run.flag}")
+            raise Damaged(f"{run.path}/{found}: it is damaged; repair it with: {hint().repair(run.path)}")
     for entry in run.recordings if RECORDINGS not in skip else ():
         own = RunDir(run.recording_path(entry["name"]))
         if own.path.is_dir():
@@ -160,4 +163,4 @@ def _check_intact(run: RunDir, skip: Sequence[str]) -> None:
                 own.info()
                 _check_intact(own, skip)
             except SlamError as error:
-                raise SlamError(f"{str(error).partition('; ')[0]}; repair it with: slamcli run {run.flag}") from error
+                raise SlamError(f"{str(error).partition('; ')[0]}; repair it with: {hint().repair(run.path)}") from error

@@ -17,6 +17,7 @@ from slamcli import __version__, address_space, files, interruption
 from slamcli.config.options import Config
 from slamcli.console import Progress, Tell, silent, stage_line
 from slamcli.errors import SlamError
+from slamcli.hints import hint
 from slamcli.jit import compilation
 from slamcli.parallel import one_thread_in_blas
 from slamcli.runs import damage, source_code, staleness
@@ -176,7 +177,7 @@ class Pipeline:
     def notes(self, states: Mapping[str, State]) -> list[str]:
         """Say what is worth knowing beside the states: a recording that is gone, results made with other versions."""
         found = [self.recording_note] if self.recording_note else []
-        found += [f"{name} is damaged: slamcli run {self.run.flag} removes it" for name in self.run.damaged_figures()]
+        found += [f"{name} is damaged; remove it with: {hint().repair(self.run.path)}" for name in self.run.damaged_figures()]
         here = environment()
         for name, value in here.items():
             stages: dict[str, list[str]] = {}
@@ -194,7 +195,7 @@ class Pipeline:
         last = NAMES.index(until) if until else len(NAMES) - 1
         first_forced = NAMES.index(start) if start else 0 if force else len(NAMES)
         if start and last < first_forced:
-            raise SlamError(f"--from {start} --until {until}: {until} comes before {start}")
+            raise SlamError(f"{hint().argument('start')} {start} {hint().argument('until')} {until}: {until} comes before {start}")
         self._tell(f"{self.run.info()['dataset']} -> {self.run.path}")
         known: dict[str, State] = {}  # what holds is looked at once; whoever reads a file of it compares it again
         for index, stage in enumerate(STAGES[: last + 1]):
@@ -216,20 +217,20 @@ class Pipeline:
         for need in reversed(needs):  # the latest first: its advice brings the others too
             if need.state == staleness.MISSING:
                 raise SlamError(
-                    f"{name} needs {need.stage}, which {self.run.why_missing(need.stage)}: slamcli run --until {need.stage} {self.run.flag}"
+                    f"{name} needs {need.stage}, which {self.run.why_missing(need.stage)}: {hint().update(self.run.path, until=need.stage)}"
                 )
             if need.state == staleness.DAMAGED:
                 raise SlamError(
-                    f"{name} needs {need.stage}, which is damaged ({need.reason}); try: slamcli run --until {need.stage} {self.run.flag}"
+                    f"{name} needs {need.stage}, which is damaged ({need.reason}); try: {hint().update(self.run.path, until=need.stage)}"
                 )
         for need in needs:
             if not need.is_fresh:
                 log.warning(
-                    "%s rests on %s, which is stale (%s); bring it up to date with: slamcli run %s",
+                    "%s rests on %s, which is stale (%s); bring it up to date with: %s",
                     name,
                     need.stage,
                     need.reason,
-                    self.run.flag,
+                    hint().update(self.run.path),
                 )
         self.run_stage(stage)
 

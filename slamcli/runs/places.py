@@ -5,6 +5,7 @@ import os
 from pathlib import Path
 
 from slamcli.errors import SlamError
+from slamcli.hints import hint
 from slamcli.stages import NAMES
 
 log = logging.getLogger(__name__)
@@ -23,8 +24,10 @@ def find(run: str | None) -> Path:
     if is_run(path):
         return path if named else Path(os.path.relpath(path.resolve()))
     if named:
-        raise SlamError(f"{path}: not a run directory (it has no run.json); make one with: slamcli run TARGET -r {path}")
-    raise SlamError("no run here yet (runs/latest leads nowhere); make one with: slamcli run demo, or name one with -r")
+        raise SlamError(f"{path}: not a run directory (it has no run.json); make one with: {hint().make(path)}")
+    raise SlamError(
+        f"no run here yet (runs/latest leads nowhere); make one with: {hint().demo()}, or name one with {hint().argument('path')}"
+    )
 
 
 def mark_latest(path: Path) -> None:
@@ -43,7 +46,7 @@ def default_path(dataset: str) -> Path:
     """Name the run directory of a recording; SlamError for a name that would not stay under ``runs/``."""
     parts = Path(dataset).parts
     if not parts or ".." in parts or Path(dataset).is_absolute() or dataset == LATEST.name:
-        raise SlamError(f"no run directory can be named after a recording called {dataset!r}; name one with -r")
+        raise SlamError(f"no run directory can be named after a recording called {dataset!r}; name one with {hint().argument('path')}")
     return RUNS / dataset
 
 

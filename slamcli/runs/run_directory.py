@@ -7,7 +7,6 @@ or absent, whatever kills the program.
 import contextlib
 import logging
 import os
-import shlex
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -19,6 +18,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from slamcli import files
 from slamcli.config.options import Config
 from slamcli.errors import Damaged, SlamError
+from slamcli.hints import hint
 from slamcli.runs import damage, places, run_lock, source_code, staleness
 from slamcli.runs.places import RECORDINGS
 from slamcli.runs.staleness import State
@@ -68,7 +68,7 @@ class RunDir:
             about["recordings"] = [dict(entry) for entry in recordings]
         if not places.is_run(run.path):
             if run.path.is_dir() and any(not entry.name.startswith(".") for entry in run.path.iterdir()):
-                raise SlamError(f"{path}: the folder is not empty and not a run directory; name another with -r")
+                raise SlamError(f"{path}: the folder is not empty and not a run directory; name another with {hint().argument('path')}")
             if run.path.parent.name != RECORDINGS:  # where a run of several has those of each
                 places.refuse_inside(run.path)
             run.path.mkdir(parents=True, exist_ok=True)
@@ -88,11 +88,17 @@ class RunDir:
     def _checked(self) -> "RunDir":
         info = self.info()
         if info.get("format") != FORMAT:
-            raise SlamError(f"{self.path}: a run of format {info.get('format')}, this slamcli reads {FORMAT}; start another with -r")
+            raise SlamError(
+                f"{self.path}: a run of format {info.get('format')}, this slamcli reads {FORMAT}; start another with {hint().argument('path')}"
+            )
         if not all(isinstance(info.get(name), str) for name in ("dataset", "root", "digest", "created")):
-            raise SlamError(f"{self.path / 'run.json'}: dataset, root, digest or created is missing; start another run with -r")
+            raise SlamError(
+                f"{self.path / 'run.json'}: dataset, root, digest or created is missing; start another run with {hint().argument('path')}"
+            )
         if not all(_is_entry(entry) for entry in info.get("recordings", [])):
-            raise SlamError(f"{self.path / 'run.json'}: a recording lacks name, dataset, root or digest; start another run with -r")
+            raise SlamError(
+                f"{self.path / 'run.json'}: a recording lacks name, dataset, root or digest; start another run with {hint().argument('path')}"
+            )
         return self
 
     def mark_latest(self) -> None:
@@ -100,11 +106,6 @@ class RunDir:
         places.mark_latest(self.path)
 
     # what belongs to the whole run
-
-    @property
-    def flag(self) -> str:
-        """Return the words that make a command act on this run, for hints that are pasted whole."""
-        return f"-r {shlex.quote(str(self.path))}"
 
     @property
     def recordings(self) -> list[dict[str, str]]:
@@ -125,7 +126,7 @@ class RunDir:
                 info = files.read_json(path)
                 if files.SEAL not in info and info.get("format") not in (None, FORMAT):  # older, not damaged
                     return info
-            raise Damaged(f"{error}; restore it with: slamcli run {self.flag}, or: slamcli run TARGET {self.flag}") from error
+            raise Damaged(f"{error}; restore it with: {hint().repair(self.path)}, or: {hint().make(self.path)}") from error
 
     def _write_info(self, info: Mapping[str, Any]) -> None:
         now = datetime.now(UTC).isoformat(timespec="seconds")
@@ -172,7 +173,8 @@ class RunDir:
                 log.warning("%s was damaged; restored from %s", self.path / "config.toml", source)
             for name in figures:  # no stage makes them, the commands that found them do
                 (self.path / name).unlink(missing_ok=True)
-                log.warning("%s was damaged, and is removed; give slamcli eval or slamcli report again for it", self.path / name)
+                again = f"{hint().measure(self.path)} or {hint().report(self.path)}"
+                log.warning("%s was damaged, and is removed; make it again with: %s", self.path / name, again)
 
     def damaged_figures(self) -> list[str]:
         """Name the files in which `eval` and `report` kept their findings and that are not as they were written."""
@@ -202,10 +204,10 @@ class RunDir:
         config, info = config or self.config(), self.info()
         entries = info.get("recordings", [])
         if not entries:
-            return open_recording(info["root"], config, self.flag)
+            return open_recording(info["root"], config, self.path)
         from slamcli.datasets.joined import JoinedDataset
 
-        opened = [open_recording(entry["root"], config, self.flag) for entry in entries]
+        opened = [open_recording(entry["root"], config, self.path) for entry in entries]
         return JoinedDataset(opened, [entry["name"] for entry in entries])
 
     def camera(self, stage: str = "extract") -> "Camera":
@@ -229,9 +231,9 @@ class RunDir:
         """Name the folder of a finished stage, or a file in it; SlamError says how to make it when it is not there."""
         path = self.path.joinpath(stage, *names)
         if not (self.path / stage / "stage.json").exists():
-            raise SlamError(f"{self.path}: {stage} {self.why_missing(stage)}: slamcli run --until {stage} {self.flag}")
+            raise SlamError(f"{self.path}: {stage} {self.why_missing(stage)}: {hint().update(self.path, until=stage)}")
         if not path.exists():
-            raise SlamError(f"{path}: not there; make it with: slamcli {stage} {self.flag}")
+            raise SlamError(f"{path}: not there; make it with: {hint().stage(self.path, stage)}")
         if names:
             self.intact(stage, "/".join(names))
         self._warn_unless_fresh(stage)
@@ -249,9 +251,9 @@ class RunDir:
         record = self.record(stage) or {"outputs": {}}
         for name in names:
             if name not in record["outputs"]:
-                raise SlamError(f"{self.path / stage / name}: not there; make it with: slamcli {stage} {self.flag}")
+                raise SlamError(f"{self.path / stage / name}: not there; make it with: {hint().stage(self.path, stage)}")
         if found := damage.find(self.path / stage, record["outputs"], names, verify=True):
-            raise Damaged(f"{self.path}/{found}: it is damaged; repair it with: slamcli run {self.flag}")
+            raise Damaged(f"{self.path}/{found}: it is damaged; repair it with: {hint().repair(self.path)}")
         return self.path / stage
 
     def _warn_unless_fresh(self, stage: str) -> None:
@@ -267,7 +269,7 @@ class RunDir:
             return
         if state.reason not in self._warned:  # of several stages that are stale for one reason, one tells it
             log.warning(
-                "%s: %s is %s (%s); bring it up to date with: slamcli run %s", self.path, stage, state.state, state.reason, self.flag
+                "%s: %s is %s (%s); bring it up to date with: %s", self.path, stage, state.state, state.reason, hint().update(self.path)
             )
         self._warned |= {stage, state.reason}
 
@@ -324,9 +326,9 @@ class RunDir:
         try:
             record = files.read_sealed(path)
         except SlamError as error:
-            raise Damaged(f"{error}; repair it with: slamcli run {self.flag}") from error
+            raise Damaged(f"{error}; repair it with: {hint().repair(self.path)}") from error
         if "format" not in record or (record["format"] == FORMAT and not damage.is_record(record)):
-            raise Damaged(f"{path}: not a stage's record; repair it with: slamcli run {self.flag}")
+            raise Damaged(f"{path}: not a stage's record; repair it with: {hint().repair(self.path)}")
         return record
 
     def damage(self, stage: str, *, verify: bool = False) -> str:
@@ -373,18 +375,18 @@ class RunDir:
         shutil.rmtree(old, ignore_errors=True)
 
 
-def open_recording(root: str, config: Config, flag: str) -> "Dataset":
-    """Open a recording that a run was made of; SlamError where it is gone, with the run's `flag` in the advice."""
+def open_recording(root: str, config: Config, run: Path) -> "Dataset":
+    """Open a recording that a run was made of; SlamError where it is gone, with the `run` in the advice."""
     from slamcli.datasets import open_dataset
 
     if not Path(root).exists():
-        raise SlamError(f"{root}: the recording is not there any more; put it back, or: slamcli run TARGET {flag}")
+        raise SlamError(f"{root}: the recording is not there any more; put it back, or: {hint().make(run)}")
     return open_dataset(root, camera=dict(config.camera) or None, options=config.recording)
 
 
 def _holds_another(path: Path, roots: list[str]) -> str:
     told = f"another recording ({roots[0]})" if len(roots) == 1 else f"other recordings ({', '.join(roots)})"
-    return f"{path}: holds a run of {told}; name another folder with -r, or add to that map with: slamcli add {shlex.quote(str(path))} RECORDING"
+    return f"{path}: holds a run of {told}; name another folder with {hint().argument('path')}, or add to that map with: {hint().add(path)}"
 
 
 def _is_entry(entry: Any) -> bool:

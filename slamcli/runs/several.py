@@ -116,7 +116,7 @@ def extend(run: RunDir, datasets: Sequence[Dataset]) -> None:
                 raise SlamError(f"{dataset.root}: the same recording as {entry['root']}, which is in {run.path} already")
     found = [*there, *entries(new, taken=[entry["name"] for entry in there])]
     config = run.config()
-    opened = [*(open_recording(entry["root"], config, run.flag) for entry in there), *new]
+    opened = [*(open_recording(entry["root"], config, run.path) for entry in there), *new]
     dataset = joined(found, opened)
     run.extend(dataset=dataset.name, root=str(dataset.root), digest=dataset.digest(), recordings=found)
 

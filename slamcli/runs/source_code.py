@@ -29,6 +29,7 @@ APART = frozenset(
         "stages/__init__.py",  # the table: what of it matters to a stage, its needs and its sections, is in the key itself
         "config/options.py",  # declares the options, whose values are in the key
         "console.py",  # what the user sees
+        "hints.py",  # what the user is advised
         "jit/cache.py",  # where machine code is kept
         "jit/compilation.py",  # when it is compiled
         "user_cache.py",

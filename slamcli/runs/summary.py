@@ -1,6 +1,5 @@
 """What a finished run made, in a few lines, and what can be done with it."""
 
-from pathlib import Path
 from typing import Any
 
 from slamcli.console import table
@@ -60,20 +59,3 @@ def _cost(records: dict[str, Any]) -> list[str]:
     seconds, n_frames = sum(record["seconds"] for record in records.values()), records["extract"]["summary"]["frames"]
     peak = max(record["peak_rss_mb"] for record in records.values())
     return ["cost", f"{seconds:.1f} s, {n_frames / max(seconds, 1e-3):.1f} frames/s, {peak:.0f} MiB"]
-
-
-def next_commands(run: RunDir, *, is_usable: bool) -> list[str]:
-    """List the commands that come next for this run, each to be pasted as it is; none for a robot where no floor is free.
-
-    is_usable : whether a robot could use the map, by its verdict
-    """
-    roots = [entry["root"] for entry in run.recordings] or [run.info()["root"]]
-    has_truth = any((Path(root) / "groundtruth.txt").is_file() for root in roots)
-    has_floor = (run.record("grid2d") or {"summary": {}})["summary"].get("free", 0) > 0
-    which = run.flag
-    return [
-        *([f"slamcli eval ape {which}"] if has_truth else []),
-        f"slamcli report {which}",
-        *([f"slamcli export-grid map.pgm --png map.png {which}"] if has_floor else []),
-        *([f"slamcli plan --start first --reachable {which}"] if has_floor and is_usable else []),
-    ]

@@ -17,6 +17,7 @@ from slamcli.depth import at_key_points, coarse_images, icp
 from slamcli.depth.coarse_images import CoarseImages
 from slamcli.errors import BadFrame, SlamError
 from slamcli.geometry.camera import Camera
+from slamcli.hints import hint
 from slamcli.parallel import ordered_map
 from slamcli.schema import CoarseDepth, Features, Flow
 from slamcli.slam import doubt, stream_doubt
@@ -68,7 +69,7 @@ def assemble(found: Iterable[Frame], inputs: Inputs, out: Path, cfg: Config, too
             tools.warn(f"frame {i} skipped: {fault}" if n[i] == 0 else f"frame {i} has no depth: {fault}")
     if not n.any():
         blank = (
-            f"{dataset.root}: no feature in any of the {len(dataset)} colour frames: are they blank? try: slamcli inspect {dataset.root}"
+            f"{dataset.root}: no feature in any of the {len(dataset)} colour frames: are they blank? try: {hint().inspect(dataset.root)}"
         )
         images = CoarseImages(coarse)
         if not any(images[i].any() for i in range(len(images))):

@@ -25,6 +25,7 @@ from slamcli.errors import SlamError
 from slamcli.geometry import elementary
 from slamcli.geometry.camera import Camera
 from slamcli.geometry.common_camera import Retelling
+from slamcli.hints import hint
 from slamcli.schema import (
     CoarseDepth,
     DepthTimes,
@@ -167,7 +168,8 @@ def join_optimize(parts: Sequence[RecordingPart], inputs: Inputs, out: Path, cfg
     for name in ("intrinsics", "depth_scale"):
         if getattr(cfg.optimize, name):
             raise SlamError(
-                f"optimize.{name}: not with several recordings; find it in a run of one, then give what camera.json says there with -s camera.fx=..."
+                f"optimize.{name}: not with several recordings; find it in a run of one, then give what camera.json says there "
+                f"with {hint().setting('camera.fx')}"
             )
     features, offset, camera = inputs.load(Features, "extract"), inputs.load(Recordings, "extract").recording_offset, inputs.camera()
     tracks, map_ = _joined_map(parts, "optimize", features, offset)

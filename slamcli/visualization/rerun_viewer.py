@@ -17,6 +17,7 @@ from slamcli.evaluation.run_content import Content, collect
 from slamcli.formats import cloud, octomap
 from slamcli.geometry import voxel
 from slamcli.geometry.octree import CENTRE, DEPTH
+from slamcli.hints import hint
 from slamcli.runs.run_directory import RunDir
 from slamcli.schema import KEY_FRAME, Features, Grid, Moving
 from slamcli.visualization import moving_tint
@@ -70,7 +71,7 @@ def _spawn(recording: Any, blueprint: Any) -> None:
     try:
         recording.spawn(default_blueprint=blueprint)
     except (RuntimeError, OSError) as error:
-        raise SlamError(f"the viewer does not start ({error}); write a file instead with: slamcli view --save run.rrd") from None
+        raise SlamError(f"the viewer does not start ({error}); write a file instead with: {hint().save_view()}") from None
 
 
 def _blueprint(has_truth: bool) -> Any:

@@ -73,7 +73,7 @@ def test_any_assignment_is_taken_or_refused_in_one_line(text: str) -> None:
         ("track.min_inlier=20", "track.min_inlier is not known; did you mean track.min_inliers?"),
         ("trck.min_inliers=20", "trck.min_inliers is not known; did you mean track.min_inliers?"),
         ("min_inliers=20", "min_inliers is not known; did you mean track.min_inliers or loop.min_inliers?"),
-        ("qqq.zzz=1", "qqq.zzz is not known; see: slamcli config --explain"),
+        ("qqq.zzz=1", "qqq.zzz is not known; see: slamcli.config.toml.known_keys()"),
         ("track.min_inliers=2", "must be >= 4, <= 20000 (fewer inliers: the frame is lost)"),
         ("track.min_inliers=4.5", "must be a whole number"),
         ("track.min_inliers=true", "must be a whole number"),
@@ -91,8 +91,8 @@ def test_any_assignment_is_taken_or_refused_in_one_line(text: str) -> None:
         ("extract.features=1000000000", "must be >= 50, <= 20000 (key points"),
         ("octree.resolution=1e-9", "must be >= 0.001, <= 10 (leaf side"),
         ("octree.resolution=" + "9" * 5000, "9...: "),
-        ("seed", "write -s section.key=value"),
-        ("=1", "write -s section.key=value"),
+        ("seed", "write settings section.key=value"),
+        ("=1", "write settings section.key=value"),
         ("track=1", "track is a section"),
         ("camera=1", "camera is a section"),
         ("camera.fz=1", "camera.fz is not known; did you mean camera.f"),
@@ -104,7 +104,7 @@ def test_any_assignment_is_taken_or_refused_in_one_line(text: str) -> None:
 def test_a_wrong_assignment_names_the_key_and_what_would_do(assignment: str, message: str) -> None:
     with pytest.raises(SlamError) as caught:
         toml.apply(Config(), [assignment])
-    assert str(caught.value).startswith("-s ")
+    assert str(caught.value).startswith("settings ")
     assert message in str(caught.value)
 
 

@@ -152,7 +152,9 @@ def test_a_stage_alone_runs_even_when_fresh_and_only_it(pipeline: Pipeline, capl
 
 def test_a_stage_alone_says_which_stage_it_waits_for(tmp_path: Path) -> None:
     pipeline = fakes.make_run(tmp_path / "run", tmp_path)
-    with pytest.raises(SlamError, match="^track needs match, which has not been run; try: slamcli run --until match -r "):
+    with pytest.raises(
+        SlamError, match=r"^track needs match, which has not been run; try: slamcli.open_run\(.*\).update\(until='match'\)$"
+    ):
         pipeline.run_alone("track")
 
 

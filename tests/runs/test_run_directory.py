@@ -72,7 +72,7 @@ def test_no_latest_where_the_current_folder_cannot_be_written(tmp_path: Path, mo
 
 def test_no_run_and_no_such_run_say_what_to_do(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(SlamError, match="make one with: slamcli run demo"):
+    with pytest.raises(SlamError, match=r'make one with: slamcli.run\("demo"\), or name one with path'):
         RunDir.find(None)
     with pytest.raises(SlamError, match="runs/x: not a run directory"):
         RunDir.find("runs/x")
@@ -80,7 +80,7 @@ def test_no_run_and_no_such_run_say_what_to_do(tmp_path: Path, monkeypatch: pyte
 
 @pytest.mark.parametrize("name", ["", "..", "../x", "/etc", "latest", "a/../../b"])
 def test_no_recording_name_leads_out_of_runs(name: str) -> None:
-    with pytest.raises(SlamError, match="name one with -r"):
+    with pytest.raises(SlamError, match="name one with path"):
         places.default_path(name)
 
 
@@ -89,7 +89,9 @@ def test_a_run_belongs_to_one_recording_which_may_move_or_change(tmp_path: Path)
     create(path, "/old", "sha256:1")
     assert create(path, "/new", "sha256:1").info()["root"] == "/new"
     assert create(path, "/new", "sha256:2").info()["digest"] == "sha256:2"
-    with pytest.raises(SlamError, match=r"holds a run of another recording \(/new\); name another folder with -r"):
+    with pytest.raises(
+        SlamError, match=r"holds a run of another recording \(/new\); name another folder with path, or add .*\.add\(RECORDING\)$"
+    ):
         create(path, "/other", "sha256:3")
 
 
@@ -104,7 +106,7 @@ def test_a_folder_of_something_else_is_never_taken_over(tmp_path: Path) -> None:
     ("text", "message"),
     [
         (f'{{"format": {FORMAT + 1}}}', f"a run of format {FORMAT + 1}, this slamcli reads {FORMAT}"),
-        (f'{{"format": {FORMAT}}}', "not as slamcli wrote it; restore it with: slamcli run -r"),
+        (f'{{"format": {FORMAT}}}', "not as slamcli wrote it; restore it with: slamcli.open_run("),
         ("{", "not valid JSON"),
         ("", "not valid JSON"),
         ("[" * 100_000, "not valid JSON"),
@@ -204,14 +206,14 @@ def test_a_result_of_another_version_is_stale(run: RunDir) -> None:
 def test_a_missing_stage_is_named_with_the_command_that_makes_it(run: RunDir, caplog: pytest.LogCaptureFixture) -> None:
     assert run.stage_path("loop", "out.txt").read_text()
     assert not caplog.text
-    with pytest.raises(SlamError, match=r"loop/cloud.ply: not there; make it with: slamcli loop"):
+    with pytest.raises(SlamError, match=r"loop/cloud.ply: not there; make it with: slamcli.open_run\(.*\).run_stage\('loop'\)$"):
         run.stage_path("loop", "cloud.ply")
     shutil.rmtree(run.path / "loop")
-    with pytest.raises(SlamError, match="loop is not there any more; make it anew with: slamcli run --until loop"):
+    with pytest.raises(SlamError, match=r"loop is not there any more; make it anew with: slamcli.open_run\(.*\).update\(until='loop'\)$"):
         run.stage_path("loop")
     for stage in NAMES[NAMES.index("loop") + 1 :]:
         shutil.rmtree(run.path / stage)
-    with pytest.raises(SlamError, match="loop has not been run; try: slamcli run --until loop"):
+    with pytest.raises(SlamError, match=r"loop has not been run; try: slamcli.open_run\(.*\).update\(until='loop'\)$"):
         run.stage_path("loop")
 
 
@@ -219,7 +221,7 @@ def test_reading_a_stale_result_warns_once(run: RunDir, caplog: pytest.LogCaptur
     run.write_config(dataclasses.replace(run.config(), seed=1))
     run.stage_path("loop")
     run.stage_path("loop")
-    assert caplog.text.count("loop is stale (config: seed 0 -> 1); bring it up to date with: slamcli run") == 1
+    assert caplog.text.count("loop is stale (config: seed 0 -> 1); bring it up to date with: slamcli.open_run(") == 1
 
 
 # writing

@@ -13,6 +13,7 @@ from slamcli.datasets.recorded import Recorded, Stream, truth_of_rows
 from slamcli.datasets.sqlite import Blobs, query
 from slamcli.errors import BadFrame, SlamError
 from slamcli.formats import rvl
+from slamcli.hints import hint
 
 DEPTH_SCALE = 1000.0
 RVL_MAGIC, INVERSE_MAGIC = b"DEPTHRVL", b"DEPTHINV"
@@ -82,7 +83,7 @@ def decode_depth(data: bytes, name: str) -> bytes | np.ndarray:
 def _calibration(path: Path, node: int) -> Calibration:
     (data,) = query(path, f"SELECT calibration FROM Data WHERE id = {int(node)}", what="an RTAB-Map database")[0]
     broken = SlamError(
-        f"{path}: the calibration of node {node} is missing or of a kind that is not known; put a camera's numbers by -s camera.fx=..."
+        f"{path}: the calibration of node {node} is missing or of a kind that is not known; put a camera's numbers by {hint().setting('camera.fx')}"
     )
     if data is None or len(data) < HEADER.size:
         return Calibration({})
