@@ -11,7 +11,7 @@ from slamcli.batch import storage
 from slamcli.datasets import Dataset
 from slamcli.errors import SlamError
 from slamcli.evaluation import run_content
-from slamcli.report import doubts
+from slamcli.report import remarks
 from slamcli.runs.run_directory import RunDir
 from slamcli.stages import NAMES, WITH_TRAJECTORY
 
@@ -65,7 +65,7 @@ def _judged(run: RunDir, dataset: Dataset | None) -> dict[str, Any]:
     except SlamError:  # a recording that failed half-way: the reason stands in its row
         return {}
     ape = content.ape.get(content.stage)
-    grave = [remark.text for remark in doubts.remarks(content) if remark.kind == doubts.BAD]
+    grave = [remark.text for remark in remarks.collect(content) if remark.kind == remarks.BAD]
     return {
         "coverage": round(float(content.has_pose.mean()), 4),
         "ape_m": round(ape.to_dict()["rmse"], 5) if ape else None,

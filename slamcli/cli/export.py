@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from slamcli.runs.run_directory import RunDir
 
 CLOUD = "sparse_pc.ply"  # the name under which nerfstudio's own converters write it
-LAYOUT_OF = {ending: layout for layout, endings in TRAJECTORY_FORMATS.items() for ending in endings}
+FORMAT_OF = {ending: name for name, endings in TRAJECTORY_FORMATS.items() for ending in endings}
 
 
 @click.command("export-trajectory")
@@ -32,7 +32,7 @@ LAYOUT_OF = {ending: layout for layout, endings in TRAJECTORY_FORMATS.items() fo
 )
 @frame_option
 @click.option(
-    "--format", "layout", type=click.Choice(list(TRAJECTORY_FORMATS)), help="[default: by OUT's ending]; kitti has no time stamps."
+    "--format", "format_name", type=click.Choice(list(TRAJECTORY_FORMATS)), help="[default: by OUT's ending]; kitti has no time stamps."
 )
 @click.option("--recording", metavar="NAME", help="Of a run of several recordings, the poses of this one, at its own stamps.")
 @click.option("--sure-only", is_flag=True, help="Leave out the poses that the run itself doubts; only for the final trajectory.")
@@ -43,7 +43,7 @@ def export_trajectory(
     run: str | None,
     stage: str | None,
     frame: str,
-    layout: str | None,
+    format_name: str | None,
     mount: tuple[float, ...] | None,
     as_json: bool,
     sure_only: bool,
@@ -64,24 +64,24 @@ def export_trajectory(
     from slamcli.runs.run_directory import RunDir
     from slamcli.schema import Trajectory
 
-    ending = out.suffix.lower() if layout else check_ending(out, *LAYOUT_OF, ".g2o")
+    ending = out.suffix.lower() if format_name else check_ending(out, *FORMAT_OF, ".g2o")
     folder = RunDir.find(run)
     if ending == ".g2o":
-        is_plain = (stage or "loop") == "loop" and frame == "world" and mount is None and layout is None
+        is_plain = (stage or "loop") == "loop" and frame == "world" and mount is None and format_name is None
         _export_graph(out, folder, is_plain=is_plain, as_json=as_json)
         return
-    layout = layout or LAYOUT_OF[ending]
+    format_name = format_name or FORMAT_OF[ending]
     trajectory = trajectory_error.stage_trajectory(folder, stage or trajectory_error.last_stage(folder))
     if sure_only:
         trajectory = trajectory_error.sure_part(folder, trajectory)
     if recording is not None:
         trajectory = of_several.part(folder, recording, trajectory)
     T_wc = told_in(folder, trajectory.T_wc, frame, mount)
-    trajectory_file.writer(layout)(out, Trajectory(stamp=trajectory.stamp, T_wc=T_wc))
+    trajectory_file.writer(format_name)(out, Trajectory(stamp=trajectory.stamp, T_wc=T_wc))
     n = len(trajectory.stamp)
     n_frames = trajectory_error.frame_count(folder) if recording is None else of_several.frame_count(folder, recording)
-    note = "; a KITTI file has no stamps, so its lines are not frame numbers here" if layout == "kitti" and n < n_frames else ""
-    tell_written(out, as_json, f"{n} poses of {n_frames} frames{note}", poses=n, frames=n_frames, frame=frame, format=layout)
+    note = "; a KITTI file has no stamps, so its lines are not frame numbers here" if format_name == "kitti" and n < n_frames else ""
+    tell_written(out, as_json, f"{n} poses of {n_frames} frames{note}", poses=n, frames=n_frames, frame=frame, format=format_name)
 
 
 def _export_graph(out: Path, folder: RunDir, *, is_plain: bool, as_json: bool) -> None:

@@ -221,8 +221,8 @@ def _doubts_about_depth(found: Recorded, camera: Camera, probe: _Probe) -> list[
         return [f"{found.root}: the depth images looked at hold no reading"]
     if probe.raw[0].dtype != np.uint16:
         return []
-    verdict = depth_unit.judge(depth_unit.counted(probe.raw), camera.depth_scale)
-    if verdict.likely_scale is None:
+    judged = depth_unit.judge(depth_unit.counted(probe.raw), camera.depth_scale)
+    if judged.likely_scale is None:
         return []
-    unit = f"{verdict.likely_scale:g}{' (millimetres)' if verdict.likely_scale == DEFAULT_DEPTH_SCALE else ''}"
-    return [f"{found.root}: with depth_scale {camera.depth_scale:g} {verdict.reason}; is camera.depth_scale = {unit} right?"]
+    unit = f"{judged.likely_scale:g}{' (millimetres)' if judged.likely_scale == DEFAULT_DEPTH_SCALE else ''}"
+    return [f"{found.root}: with depth_scale {camera.depth_scale:g} {judged.reason}; is camera.depth_scale = {unit} right?"]

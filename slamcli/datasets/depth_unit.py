@@ -49,7 +49,7 @@ PERCENTILES = (1, 5, 25, 50, 75, 95, 99)
 
 @dataclass(frozen=True)
 class DepthUnit:
-    """The verdict on a depth scale."""
+    """Whether a depth scale is believed, and which one fits better."""
 
     percentiles: dict[str, float]  # [m] of the readings as they are
     q: float | None  # [1/m] under the scale as it is, None where readings show no disparity steps

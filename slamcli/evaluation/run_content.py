@@ -50,7 +50,7 @@ class Content:
     states: dict[str, State]
     cleaned: frozenset[str]  # stages that were deleted on purpose, and those that were made from them
     recording: dict[str, Any]
-    doubts: list[str] = field(default_factory=list)  # of the recording's reader
+    recording_warnings: list[str] = field(default_factory=list)  # of its reader, or why it could not be opened
     verdict: Verdict | None = None  # on the map, where there is one
     starts: np.ndarray = field(default_factory=lambda: np.zeros(1, dtype=np.int64))  # (R,) first frame of each recording
     names: list[str] = field(default_factory=list)  # of several recordings
@@ -98,7 +98,7 @@ def collect(run: RunDir, dataset: Dataset | None = None) -> Content:
     truth, no_truth = _truth(dataset, not_there)
     ape = _ape(run, times.stamp, truth)
     recording = _recording(run, stage)
-    doubts = list(dataset.warnings) if dataset is not None else [not_there]
+    recording_warnings = list(dataset.warnings) if dataset is not None else [not_there]
     states = run.states()
     return Content(
         name=str(run.info()["dataset"]),
@@ -119,7 +119,7 @@ def collect(run: RunDir, dataset: Dataset | None = None) -> Content:
         states=states,
         cleaned=frozenset(name for name, state in states.items() if not state.is_fresh and run.is_cleaned(state)),
         recording=recording,
-        doubts=doubts,
+        recording_warnings=recording_warnings,
         verdict=map_verdict.of_run(run),
         starts=placement.beginnings(run),
         names=[str(entry["name"]) for entry in run.recordings],

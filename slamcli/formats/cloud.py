@@ -95,8 +95,8 @@ def _ply_header(vertex: np.dtype, n_vertices: int, *, n_faces: int | None) -> by
 def read_ply(path: Path) -> Points:
     """Read the vertices of an ASCII or binary PLY file; SlamError for one that is not what its header says."""
     with files.open_regular(path) as file:
-        layout, dtype, n = _read_ply_header(path, file)
-        if layout == "ascii":
+        encoding, dtype, n = _read_ply_header(path, file)
+        if encoding == "ascii":
             return _points(path, _read_text(path, file, dtype, n))
         return _points(path, _read_records(path, file, dtype, n))
 
@@ -112,9 +112,9 @@ def read_coloured_ply(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray | 
 def _read_ply_header(path: Path, file: BinaryIO) -> tuple[str, np.dtype, int]:
     """Read up to the vertices; gives the format, the type of a vertex and their number."""
     lines = _header_lines(path, file, first="ply", last="end_header", kind="PLY")
-    layout = next((words[1] for words in lines if words[0] == "format" and len(words) > 1), "")
-    if layout not in ("ascii", "binary_little_endian", "binary_big_endian"):
-        raise SlamError(f"{path}: the PLY format {layout[:40]!r} is not known")
+    encoding = next((words[1] for words in lines if words[0] == "format" and len(words) > 1), "")
+    if encoding not in ("ascii", "binary_little_endian", "binary_big_endian"):
+        raise SlamError(f"{path}: the PLY format {encoding[:40]!r} is not known")
     elements = [words for words in lines if words[0] == "element"]
     if not elements or elements[0][1:2] != ["vertex"] or len(elements[0]) != 3:
         raise SlamError(f"{path}: the first element of the PLY file is not 'vertex'")
@@ -127,7 +127,7 @@ def _read_ply_header(path: Path, file: BinaryIO) -> tuple[str, np.dtype, int]:
             if len(words) != 3 or words[1] not in PLY_TYPE:
                 raise SlamError(f"{path}: the vertex property {' '.join(words[1:])[:60]!r} cannot be read")
             fields.append((words[2], PLY_TYPE[words[1]]))
-    return layout, _record_type(path, fields, ">" if layout == "binary_big_endian" else "<"), n
+    return encoding, _record_type(path, fields, ">" if encoding == "binary_big_endian" else "<"), n
 
 
 def write_pcd(path: Path, xyz: np.ndarray, rgb: np.ndarray | None = None, normal: np.ndarray | None = None) -> None:
@@ -164,12 +164,12 @@ def read_pcd(path: Path) -> Points:
                 f"{path}: the PCD header's FIELDS, SIZE, TYPE and COUNT do not describe single numbers, or of a type that is not known"
             )
         n = _count(path, " ".join(header.get("POINTS", [])), "points")
-        layout = " ".join(header["DATA"])
+        encoding = " ".join(header["DATA"])
         dtype = _record_type(path, list(zip(names, kinds, strict=True)), "<")
-        if layout == "ascii":
+        if encoding == "ascii":
             return _points(path, _read_text(path, file, dtype, n))
-        if layout != "binary":
-            raise SlamError(f"{path}: PCD data of type {layout[:40]!r} cannot be read; convert it with: pcl_convert_pcd_ascii_binary")
+        if encoding != "binary":
+            raise SlamError(f"{path}: PCD data of type {encoding[:40]!r} cannot be read; convert it with: pcl_convert_pcd_ascii_binary")
         return _points(path, _read_records(path, file, dtype, n))
 
 

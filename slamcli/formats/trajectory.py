@@ -57,9 +57,9 @@ def write_kitti(path: str | Path, trajectory: Trajectory) -> None:
     files.write_text(path, "".join(" ".join(f"{value:.9e}" for value in row) + "\n" for row in rows))
 
 
-def writer(layout: str) -> Callable[[str | Path, Trajectory], None]:
+def writer(name: str) -> Callable[[str | Path, Trajectory], None]:
     """Return the function that writes one of `TRAJECTORY_FORMATS`."""
-    write: Callable[[str | Path, Trajectory], None] = globals()[f"write_{layout}"]
+    write: Callable[[str | Path, Trajectory], None] = globals()[f"write_{name}"]
     return write
 
 

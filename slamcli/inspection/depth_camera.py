@@ -105,7 +105,7 @@ class DepthCamera:
 
     @property
     def told(self) -> str:
-        """Say in words what was found."""
+        """Say in a sentence what was found."""
         turned, aside, sigma = np.degrees(np.linalg.norm(self.turn)), 1000 * np.linalg.norm(self.offset), self.sigma
         return (
             f"depth is of another camera than colour and is registered on reading, as its edges and the map tell: focal length "

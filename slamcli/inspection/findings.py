@@ -1,4 +1,4 @@
-"""Judgements of a recording in plain words: what was found, how grave it is, what to do about it."""
+"""Judgements of a recording: what was found, how grave it is, what to do about it."""
 
 from dataclasses import dataclass
 
@@ -37,7 +37,7 @@ EXPECTED_LAG = (-0.02, 0.035)  # [s]; the stamps of the first Kinect's depth are
 
 @dataclass(frozen=True)
 class RecordingFinding:
-    """One thing found, in plain words, and what to do about it."""
+    """One thing found, in a sentence for the user, and what to do about it."""
 
     level: str
     check: str

@@ -14,7 +14,7 @@ from slamcli import __version__
 from slamcli.config.options import Config
 from slamcli.console import counts
 from slamcli.evaluation.run_content import Content
-from slamcli.report import doubts
+from slamcli.report import remarks
 from slamcli.report.pictures import Picture
 from slamcli.report.template import fill, resource, thousands
 
@@ -63,9 +63,9 @@ def render(content: Content, pictures: list[Picture], inspected: Sequence[tuple[
         "page.html",
         name=content.name,
         update=content.update,
-        headline=doubts.headline(content),
+        headline=remarks.headline(content),
         cards=_cards(content),
-        remarks=doubts.remarks(content, inspected),
+        remarks=remarks.collect(content, inspected),
         errors=_errors(content),
         no_errors=content.no_truth or "Too few poses to compare with the ground truth.",
         pictures=pictures,

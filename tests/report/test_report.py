@@ -17,7 +17,7 @@ from click.testing import Result
 from slamcli import files
 from slamcli.evaluation import map_verdict
 from slamcli.evaluation.run_content import collect
-from slamcli.report import doubts, make, pictures
+from slamcli.report import make, pictures, remarks
 from slamcli.report.page import PAUSE, render
 from slamcli.runs.run_directory import RunDir
 from slamcli.schema import Grid
@@ -142,9 +142,9 @@ def test_text_from_outside_stays_text(slamcli: Command, tmp_path: Path) -> None:
 
 def test_remarks_are_sorted_by_gravity_and_name_what_is_wrong(made: finished.Finished) -> None:
     content = collect(RunDir.find(str(made.run)))
-    kinds = [remark.kind for remark in doubts.remarks(content)]
-    assert kinds == sorted(kinds, key=(doubts.BAD, doubts.NOTE, doubts.GOOD).index)
-    texts = " ".join(remark.text for remark in doubts.remarks(content))
+    kinds = [remark.kind for remark in remarks.collect(content)]
+    assert kinds == sorted(kinds, key=(remarks.BAD, remarks.NOTE, remarks.GOOD).index)
+    texts = " ".join(remark.text for remark in remarks.collect(content))
     assert "fewer than 150 features" in texts  # the fake run has none at all
 
 
@@ -152,9 +152,9 @@ def test_frames_of_other_map_segments_are_told_of(made: finished.Finished) -> No
     content = collect(RunDir.find(str(made.run)))
     T_lc = content.T_lc.copy()
     T_lc[-7:] = np.nan  # not lost, but in a frame of their own
-    texts = " ".join(remark.text for remark in doubts.remarks(dataclasses.replace(content, T_lc=T_lc)))
+    texts = " ".join(remark.text for remark in remarks.collect(dataclasses.replace(content, T_lc=T_lc)))
     assert f"7 of {len(T_lc)} frames belong to map segments that could not be joined" in texts
-    assert "belong to map segments" not in " ".join(remark.text for remark in doubts.remarks(content))
+    assert "belong to map segments" not in " ".join(remark.text for remark in remarks.collect(content))
 
 
 def test_findings_on_the_recording_are_on_the_page_and_looked_for_once(slamcli: Command, tmp_path: Path) -> None:
@@ -181,11 +181,11 @@ def test_a_page_that_cannot_be_written_names_the_users_file(slamcli: Command, ma
 def test_a_map_of_no_use_is_told_in_amber_with_the_cause(made: finished.Finished, room_run: Path) -> None:
     content = collect(RunDir.find(str(room_run)))
     assert content.verdict is not None
-    first = doubts.remarks(content)
-    assert any(r.kind == doubts.NOTE and r.text.startswith("A robot could not use this map: floor seen in 0 of 40 views") for r in first)
+    first = remarks.collect(content)
+    assert any(r.kind == remarks.NOTE and r.text.startswith("A robot could not use this map: floor seen in 0 of 40 views") for r in first)
     good = map_verdict.judge(dataclasses.replace(content.verdict.evidence, is_floor_found=True, views_with_floor=30, free_area=9.0, path_known=0.9), max_range=4.0)  # fmt: skip
-    told = doubts.remarks(dataclasses.replace(content, verdict=good))
-    assert any(r.kind == doubts.GOOD and r.text.startswith("A robot can use the map: 9.0 m2 of free floor") for r in told)
+    told = remarks.collect(dataclasses.replace(content, verdict=good))
+    assert any(r.kind == remarks.GOOD and r.text.startswith("A robot can use the map: 9.0 m2 of free floor") for r in told)
 
 
 def test_example_route_stays_in_the_largest_free_region() -> None:
@@ -247,7 +247,7 @@ def test_recordings_follow_one_another_without_the_way_between_them(made: finish
     assert data["starts"] == starts.tolist() and data["names"] == ["a", "b", "c"]
     assert content.seconds == pytest.approx(3 * span)
     assert np.isnan(content.path[:, 0]).sum() == 2 and len(content.path) == 3 * len(one.path) + 2
-    length = [float(re.search(r"along ([0-9.]+) m", doubts.headline(each)).group(1)) for each in (one, content)]
+    length = [float(re.search(r"along ([0-9.]+) m", remarks.headline(each)).group(1)) for each in (one, content)]
     assert length[1] == pytest.approx(3 * length[0], abs=0.21)
 
 
@@ -256,6 +256,6 @@ def test_the_page_does_not_send_its_reader_to_itself(made: finished.Finished) ->
     found = doubt.Finding("poses", f"3 of 9 poses are doubtful{doubt.SEE_REPORT}")
     loop = content.states["loop"]
     record = {**loop.record, "summary": doubt.joined(loop.record["summary"], [found])}
-    remarks = doubts.remarks(dataclasses.replace(content, states={**content.states, "loop": dataclasses.replace(loop, record=record)}))
-    (text,) = (remark.text for remark in remarks if "3 of 9 poses are doubtful" in remark.text)
+    said = remarks.collect(dataclasses.replace(content, states={**content.states, "loop": dataclasses.replace(loop, record=record)}))
+    (text,) = (remark.text for remark in said if "3 of 9 poses are doubtful" in remark.text)
     assert "amber in the charts" in text and "report" not in text

@@ -1,4 +1,4 @@
-"""What a reader of the page should know before trusting the result, in plain words."""
+"""Remarks: what a reader of the page should know before trusting the result, a sentence each."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -28,7 +28,7 @@ class Remark:
     text: str
 
 
-def remarks(content: Content, inspected: Sequence[tuple[str, str]] = ()) -> list[Remark]:
+def collect(content: Content, inspected: Sequence[tuple[str, str]] = ()) -> list[Remark]:
     """Judge a run; the gravest first.
 
     inspected : level ("error", "warning" or "note") and text of each finding on the recording itself
@@ -42,7 +42,7 @@ def remarks(content: Content, inspected: Sequence[tuple[str, str]] = ()) -> list
         *_scale(content),
         *_floor(content),
         *_stages(content),
-        *(Remark(NOTE, f"Recording: {text}") for text in content.doubts if not inspected),
+        *(Remark(NOTE, f"Recording: {text}") for text in content.recording_warnings if not inspected),
         *(Remark(BAD if level == "error" else NOTE, f"Recording: {text}") for level, text in inspected),
     ]
     return sorted(found, key=lambda remark: (BAD, NOTE, GOOD).index(remark.kind))
