@@ -108,6 +108,12 @@ def test_every_file_and_function_that_the_documents_name_is_there(page: Path) ->
             assert not within or within in names_in(there[what].body), f"{page.name}: {name}.{what}.{within}"
 
 
+def test_the_glossary_explains_each_word_once() -> None:
+    _, _, words = (ROOT / "docs" / "glossary.md").read_text(encoding="utf-8").partition("\n## ")[0].partition("|---|---|")
+    names = [name for row in re.findall(r"^\| ([^|]+) \|", words, re.M) for name in row.split(", ")]
+    assert len(names) > 20 and [name for name in names if names.count(name) > 1] == []
+
+
 def test_the_glossary_explains_every_count_of_every_stage(room_run: Path) -> None:
     explained: dict[str, set[str]] = {}
     stage = ""
