@@ -163,9 +163,11 @@ class TrackConfig:
     relocalize_candidates: int = option(5, "key frames tried after loss, best word score first", ge=1, le=1000)
     relocalize_inliers: int = option(45, "landmarks that must agree to recognize a place after loss; as for a closure", ge=4, le=20_000)
     segment_after: int = option(10, "frames lost in a row at which a new map segment begins; 0 = never", ge=0, le=1_000_000)
-    key_frame_share: float = option(0.6, "a frame that holds less of its reference key frame's landmarks becomes one", gt=0, le=1)
-    key_frame_gap: int = option(8, "frames between key frames at most", ge=1, le=1_000_000)
-    key_frame_crowd: int = option(12, "no key frame where this many stand within 0.1 m and 6 degrees already", ge=1, le=1_000_000)
+    key_frame_share: float = option(
+        0.6, "key frame where a view has less than this share of its reference's landmarks or depth", gt=0, le=1
+    )
+    key_frame_gap: int = option(8, "frames after which another key frame is made, unless the place is crowded", ge=1, le=1_000_000)
+    key_frame_crowd: int = option(12, "key frames within 0.1 m, 6 degrees that prevent another, unless much is new", ge=1, le=1_000_000)
     depth_icp_below: int = option(150, "with fewer landmarks, a frame is aligned by its depth image; 0 = without any", ge=0, le=100_000)
     depth_icp_hold: float = option(1.0, "how long motion continues in directions that depth leaves open, as along a wall [s]", ge=0, le=10)
     moving_objects: bool = option(True, "find what moves, such as people; poses and maps rest on what stands still")
@@ -311,7 +313,7 @@ class GridConfig:
     """The 2-D grid."""
 
     resolution: float = option(0.05, "cell side [m]", ge=1e-3, le=10)
-    source: str = option("points", "what the grid is made from: the key frames' depth, or the octree", choices=("points", "octree"))
+    source: str = option("points", "what the grid is made from: depth images, or the octree", choices=("points", "octree"))
     band_low: float = option(0.05, "the robot drives over what is lower [m]", ge=0, le=10)
     max_slope: float = option(8.0, "ramps that are no steeper are floor; 0 = level floor only [degrees]", ge=0, le=45)
     band_high: float = option(0.5, "the robot's height: what is higher is passable [m]", ge=1e-3, le=100)

@@ -100,7 +100,7 @@ def look(
     cell, half = settings.resolution, int(np.ceil(settings.max_range / settings.resolution)) + 1
     centre = np.floor(T_lk[:2, 3] / cell)
     if not (np.abs(centre) < FARTHEST_CELL).all():
-        raise SlamError("grid2d: a key frame lies absurdly far away; check the trajectory")
+        raise SlamError("grid2d: a view lies absurdly far away; check the trajectory")
     side = 2 * half + 1
     seen, crossed = blank_cells(side), np.zeros((side, side), dtype=np.uint16)
     image = DepthImage(np.ascontiguousarray(depth, dtype=np.float32), rays, np.ascontiguousarray(T_lk, dtype=np.float64))
