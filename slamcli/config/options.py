@@ -163,9 +163,7 @@ class TrackConfig:
     relocalize_candidates: int = option(5, "key frames tried after loss, best word score first", ge=1, le=1000)
     relocalize_inliers: int = option(45, "landmarks that must agree to recognize a place after loss; as for a closure", ge=4, le=20_000)
     segment_after: int = option(10, "frames lost in a row at which a new map segment begins; 0 = never", ge=0, le=1_000_000)
-    key_frame_share: float = option(
-        0.6, "key frame where a view has less than this share of its reference's landmarks or depth", gt=0, le=1
-    )
+    key_frame_share: float = option(0.6, "key frame where less than this share of its reference's landmarks or depth is left", gt=0, le=1)
     key_frame_gap: int = option(8, "frames after which another key frame is made, unless the place is crowded", ge=1, le=1_000_000)
     key_frame_crowd: int = option(12, "key frames within 0.1 m, 6 degrees that prevent another, unless much is new", ge=1, le=1_000_000)
     depth_icp_below: int = option(150, "with fewer landmarks, a frame is aligned by its depth image; 0 = without any", ge=0, le=100_000)
