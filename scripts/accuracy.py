@@ -30,7 +30,7 @@ from slamcli.config import toml
 from slamcli.config.options import Config
 from slamcli.console import table
 from slamcli.errors import SlamError
-from slamcli.evaluation import trajectory_error
+from slamcli.evaluation import run_trajectories
 from slamcli.runs.pipeline import Pipeline
 from slamcli.runs.run_directory import RunDir
 from slamcli.stages import stage_named
@@ -125,7 +125,7 @@ def to_run(run: RunDir, before: Config, after: Config) -> tuple[str, ...]:
 
 def ours(run: RunDir) -> Result:
     """Return the error after each stage of a run."""
-    told = {stage: rivals.accuracy(run, trajectory_error.stage_trajectory(run, stage)) for stage in STAGES}
+    told = {stage: rivals.accuracy(run, run_trajectories.stage_trajectory(run, stage)) for stage in STAGES}
     errors = {stage: float("nan") if f["ape"] is None else f["ape"] for stage, f in told.items()}
     cpu = sum(run.record(stage)["cpu_seconds"] - run.record(stage)["compile_seconds"] for stage in STAGES)
     return Result("", 0, 1, run.config().seed, "", errors, told["loop"]["coverage"], 1e3 * cpu / rivals.n_frames(run))

@@ -34,7 +34,7 @@ import rivals
 
 from slamcli.console import table
 from slamcli.errors import SlamError
-from slamcli.evaluation import trajectory_error
+from slamcli.evaluation import run_trajectories
 from slamcli.runs.run_directory import RunDir
 from slamcli.stages import NAMES
 
@@ -144,7 +144,7 @@ def ours(run: RunDir) -> dict[str, Any]:
         "wall_seconds": sum(record["seconds"] - record["compile_seconds"] for record in records),
         "peak_mib": max(record["peak_rss_mb"] for record in records),
     }
-    return {**figures, **rivals.accuracy(run, trajectory_error.stage_trajectory(run, "loop"))}
+    return {**figures, **rivals.accuracy(run, run_trajectories.stage_trajectory(run, "loop"))}
 
 
 def plain_orb_ms(run: RunDir) -> float:

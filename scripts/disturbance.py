@@ -20,7 +20,7 @@ from slamcli import console
 from slamcli.console import table
 from slamcli.datasets import open_dataset
 from slamcli.errors import SlamError
-from slamcli.evaluation import trajectory_error
+from slamcli.evaluation import run_trajectories, trajectory_error
 from slamcli.runs.localization import localize
 from slamcli.runs.run_directory import RunDir
 from slamcli.schema import Trajectory
@@ -38,7 +38,7 @@ def main() -> None:
     given = parser.parse_args()
     try:
         lists = rewritten.listed(given.recording)
-        reference = trajectory_error.stage_trajectory(run_of(rewritten.write(given.out / "undisturbed", lists), given.out), "loop")
+        reference = run_trajectories.stage_trajectory(run_of(rewritten.write(given.out / "undisturbed", lists), given.out), "loop")
         rows = [row("undisturbed", lists, 0, 1, reference, reference), *disturbed(lists, reference, given.out, given.frames, given.seconds)]
         print(table([HEADINGS, *rows, half_in_half(lists, reference, given.out)], right=range(1, len(HEADINGS))))
     except SlamError as error:
@@ -56,7 +56,7 @@ def disturbed(lists: rewritten.Listed, reference: Trajectory, out: Path, frames:
     for name, (changed, n_black) in variants.items():
         run = run_of(rewritten.write(out / name, changed), out)
         n_segments = int(run.record("loop")["summary"]["segments"])
-        rows.append(row(name, changed, n_black, n_segments, trajectory_error.stage_trajectory(run, "loop"), reference))
+        rows.append(row(name, changed, n_black, n_segments, run_trajectories.stage_trajectory(run, "loop"), reference))
     return rows
 
 
@@ -91,7 +91,7 @@ def error(found: Trajectory, truth: Trajectory | None, n_frames: int) -> float:
     """Return the RMSE of the absolute pose error [m]."""
     if truth is None:
         raise SlamError("the recording has no ground truth to compare with")
-    return trajectory_error.statistics(trajectory_error.ape(found, truth, n_frames=n_frames, name="trajectory").error)["rmse"]
+    return trajectory_error.ape(found, truth, n_frames=n_frames, name="trajectory").rmse
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ import numpy as np
 from slamcli.config import toml
 from slamcli.console import table
 from slamcli.errors import SlamError
-from slamcli.evaluation import trajectory_error
+from slamcli.evaluation import run_trajectories, trajectory_error
 from slamcli.runs.run_directory import RunDir
 from slamcli.schema import Features, Map, Tracks, Trajectory, frame_poses
 
@@ -50,7 +50,7 @@ def main() -> None:
 
 def compared(run: RunDir) -> tuple[list[str], tuple[float, float]]:
     """Return a line of the table and both errors [m]."""
-    stamp, truth = run.load(Features, "extract").stamp, trajectory_error.ground_truth(run)
+    stamp, truth = run.load(Features, "extract").stamp, run_trajectories.ground_truth(run)
     with tempfile.TemporaryDirectory(dir=run.path.parent) as folder:  # where files can be linked instead of copied
         without = accuracy.variant(run, Path(folder) / "without", toml.apply(run.config(), ["loop.final_refinement=false"]))
         before = frame_poses(run.load(Tracks, "track"), without.load(Map, "loop"))
@@ -58,7 +58,7 @@ def compared(run: RunDir) -> tuple[list[str], tuple[float, float]]:
     has_pose = [np.isfinite(T[:, 0, 0]) for T in T_wc]
     both = has_pose[0] & has_pose[1]
     ape = (trajectory_error.ape(Trajectory(stamp=stamp[both], T_wc=T[both]), truth, n_frames=len(stamp), name=str(run.path)) for T in T_wc)
-    errors = tuple(trajectory_error.statistics(found.error)["rmse"] for found in ape)
+    errors = tuple(found.rmse for found in ape)
     counts = [str(int(one.sum())) for one in has_pose]
     change = f"{100 * (errors[1] / errors[0] - 1):+.1f} %"
     return [str(run.path), str(len(stamp)), *counts, *(f"{error:.5f}" for error in errors), change], errors

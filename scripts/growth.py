@@ -25,7 +25,7 @@ import rewritten
 from slamcli import console
 from slamcli.console import table
 from slamcli.errors import SlamError
-from slamcli.evaluation import trajectory_error
+from slamcli.evaluation import run_trajectories, trajectory_error
 from slamcli.runs.run_directory import RunDir
 from slamcli.stages import NAMES
 
@@ -133,9 +133,9 @@ def summary(run: RunDir) -> str:
     """Tell what became of a run."""
     loop, key_frames = run.record("loop")["summary"], run.record("track")["summary"]["key_frames"]
     found = trajectory_error.ape(
-        trajectory_error.stage_trajectory(run, "loop"), trajectory_error.ground_truth(run), n_frames=loop["frames"], name="loop"
+        run_trajectories.stage_trajectory(run, "loop"), run_trajectories.ground_truth(run), n_frames=loop["frames"], name="loop"
     )
-    ape = trajectory_error.statistics(found.error)["rmse"]
+    ape = found.rmse
     return f"{loop['frames']} frames: {key_frames} key frames, {loop['closures']} closures, {loop['lost']} lost, APE {ape:.4f} m"
 
 

@@ -23,7 +23,7 @@ from slamcli.console import table
 from slamcli.dense import occupancy
 from slamcli.dense.occupancy import OccupancyMap
 from slamcli.errors import SlamError
-from slamcli.evaluation import grid_truth, trajectory_error
+from slamcli.evaluation import grid_truth, run_trajectories, trajectory_error
 from slamcli.formats import cloud, octomap
 from slamcli.geometry import se3
 from slamcli.geometry.octree import Octree, expand, prune
@@ -70,7 +70,7 @@ def truth(run: RunDir) -> list[str]:
     scene = grid_truth.read_scene(run.dataset().root / "scene.json")
     n_frames = len(run.load(Features, "extract").stamp)
     aligned = trajectory_error.ape(
-        trajectory_error.stage_trajectory(run, "loop"), trajectory_error.ground_truth(run), n_frames=n_frames, name=""
+        run_trajectories.stage_trajectory(run, "loop"), run_trajectories.ground_truth(run), n_frames=n_frames, name=""
     )
     xyz = cloud.read_ply(run.stage_path("densify", "cloud.ply"))[0].astype(np.float64)
     error = 1e3 * surface_distance(scene, se3.transform(aligned.T_gw @ se3.inverse(run.load(Ground, "densify").T_lw), xyz))

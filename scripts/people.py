@@ -21,7 +21,7 @@ import rivals
 from slamcli import artifacts, console
 from slamcli.cli.main import cli
 from slamcli.datasets.simulated import people
-from slamcli.evaluation import trajectory_error
+from slamcli.evaluation import run_trajectories, trajectory_error
 from slamcli.runs.run_directory import RunDir
 from slamcli.schema import Doubt, Features, Moving
 
@@ -93,8 +93,8 @@ def doubt(run: Path) -> tuple[str, str]:
     """Count the doubtful among the frames wrong by more than 5 cm, and among those wrong by less than 1 cm."""
     folder = RunDir.find(str(run))
     found = trajectory_error.ape(
-        trajectory_error.stage_trajectory(folder, "loop"),
-        trajectory_error.ground_truth(folder),
+        run_trajectories.stage_trajectory(folder, "loop"),
+        run_trajectories.ground_truth(folder),
         n_frames=rivals.n_frames(folder),
         name=run.name,
     )

@@ -21,7 +21,7 @@ from slamcli import console
 from slamcli.console import table
 from slamcli.datasets.association import associate
 from slamcli.datasets.simulate import simulate
-from slamcli.evaluation import trajectory_error
+from slamcli.evaluation import run_trajectories, trajectory_error
 from slamcli.geometry import se3
 from slamcli.runs.run_directory import RunDir
 from slamcli.schema import Closures, Features, Map
@@ -98,11 +98,11 @@ def one(folder: Path, name: str, settings: dict[str, Any], laps: float, rival: l
     if not recording.exists():
         simulate(recording, progress=console.progress, **settings)
     run = slamcli.run(recording, path=path, progress=console.progress, tell=console.say).directory
-    truth, n_frames = trajectory_error.ground_truth(run), len(run.load(Features, "extract").stamp)
+    truth, n_frames = run_trajectories.ground_truth(run), len(run.load(Features, "extract").stamp)
     ape = {}
     for stage in WITH_TRAJECTORY:
-        error = trajectory_error.ape(trajectory_error.stage_trajectory(run, stage), truth, n_frames=n_frames, name=stage).error
-        ape[stage] = trajectory_error.statistics(error)["rmse"]
+        error = trajectory_error.ape(run_trajectories.stage_trajectory(run, stage), truth, n_frames=n_frames, name=stage).error
+        ape[stage] = trajectory_error.rmse(error)
     frames, is_true = closures(run)
     summary_ = run.record("loop")["summary"]
     cpu = {stage: record["cpu_seconds"] - record["compile_seconds"] for stage in NAMES if (record := run.record(stage)) is not None}
@@ -123,7 +123,7 @@ def one(folder: Path, name: str, settings: dict[str, Any], laps: float, rival: l
 
 def closures(run: RunDir) -> tuple[np.ndarray, np.ndarray]:
     """Return the frames (C, 2) of each accepted closure and whether it is true (C,)."""
-    found, stamp, truth = run.load(Closures, "loop"), run.load(Features, "extract").stamp, trajectory_error.ground_truth(run)
+    found, stamp, truth = run.load(Closures, "loop"), run.load(Features, "extract").stamp, run_trajectories.ground_truth(run)
     T_gc = np.full((len(stamp), 4, 4), np.nan)
     rows = associate(stamp, truth.stamp)
     T_gc[rows[:, 0]] = truth.T_wc[rows[:, 1]]

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from slamcli.errors import SlamError
-from slamcli.evaluation import trajectory_error
+from slamcli.evaluation import run_trajectories, trajectory_error
 from slamcli.formats.trajectory import read_tum
 from slamcli.runs.run_directory import RunDir
 
@@ -49,10 +49,10 @@ def accuracy(run: RunDir, found: Any) -> dict[str, Any]:
     """Return APE [m], None where no pose can be compared, and the share of colour frames with a pose."""
     coverage = len(found.stamp) / n_frames(run)
     try:
-        error = trajectory_error.ape(found, trajectory_error.ground_truth(run), n_frames=n_frames(run), name=str(run.path)).error
+        error = trajectory_error.ape(found, run_trajectories.ground_truth(run), n_frames=n_frames(run), name=str(run.path)).error
     except SlamError:
         return {"ape": None, "coverage": coverage}
-    return {"ape": trajectory_error.statistics(error)["rmse"], "coverage": coverage}
+    return {"ape": trajectory_error.rmse(error), "coverage": coverage}
 
 
 def n_frames(run: RunDir) -> int:

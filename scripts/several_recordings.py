@@ -22,7 +22,7 @@ import numpy as np
 from slamcli import api
 from slamcli.datasets import silent
 from slamcli.datasets.simulate import simulate
-from slamcli.evaluation import of_several, trajectory_error
+from slamcli.evaluation import of_several, run_trajectories, trajectory_error
 from slamcli.runs.run_directory import RunDir
 from slamcli.runs.several import LAST
 from slamcli.schema import Map, Recordings
@@ -69,7 +69,7 @@ def one_house(takes: dict[str, Path]) -> None:
     runs = [api.run([takes[name] for name in order], path=f"runs/{order}", until="loop").directory for order in ("abc", "cab")]
     whole = error(runs[0])
     print(f"A B C together: APE {1000 * whole.rmse:.2f} mm, {whole.n_poses} of {whole.n_frames} frames in one frame")
-    for part in of_several.apes(runs[0], whole, trajectory_error.ground_truth(runs[0])):
+    for part in of_several.apes(runs[0], whole, run_trajectories.ground_truth(runs[0])):
         print(f"  {part.name}: {1000 * part.rmse:.2f} mm")
     T_wk = [run.load(Map, "loop").T_wk for run in runs]
     same = T_wk[0].shape == T_wk[1].shape
@@ -122,9 +122,9 @@ def of_a_pair(pair: int, twin: int) -> dict[str, Any]:
 
 def error(run: RunDir) -> trajectory_error.Ape:
     """Measure a run's last trajectory."""
-    n_frames = trajectory_error.frame_count(run)
-    truth = trajectory_error.ground_truth(run)
-    return trajectory_error.ape(trajectory_error.stage_trajectory(run, "loop"), truth, n_frames=n_frames, name="", stage="loop")
+    n_frames = run_trajectories.frame_count(run)
+    truth = run_trajectories.ground_truth(run)
+    return trajectory_error.ape(run_trajectories.stage_trajectory(run, "loop"), truth, n_frames=n_frames, name="", stage="loop")
 
 
 def cpu_seconds(run: RunDir, stages: tuple[str, ...]) -> float:

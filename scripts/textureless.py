@@ -17,7 +17,7 @@ import slamcli
 from slamcli import console
 from slamcli.console import table
 from slamcli.datasets.simulate import simulate
-from slamcli.evaluation import trajectory_error
+from slamcli.evaluation import run_trajectories, trajectory_error
 from slamcli.runs.run_directory import RunDir
 from slamcli.schema import Features
 from slamcli.stages import WITH_TRAJECTORY
@@ -51,9 +51,9 @@ def one(folder: Path, settings: dict[str, Any], rival: list[str] | None) -> list
     if not recording.exists():
         simulate(recording, progress=console.progress, **settings)
     run = slamcli.run(recording, path=path, until="loop", progress=console.progress, tell=console.say).directory
-    truth, n_frames = trajectory_error.ground_truth(run), len(run.load(Features, "extract").stamp)
+    truth, n_frames = run_trajectories.ground_truth(run), len(run.load(Features, "extract").stamp)
     errors = [
-        trajectory_error.ape(trajectory_error.stage_trajectory(run, s), truth, n_frames=n_frames, name=s).error for s in WITH_TRAJECTORY
+        trajectory_error.ape(run_trajectories.stage_trajectory(run, s), truth, n_frames=n_frames, name=s).error for s in WITH_TRAJECTORY
     ]
     track = run.record("track")
     cpu = 1e3 * (track["cpu_seconds"] - track["compile_seconds"]) / n_frames
@@ -62,7 +62,7 @@ def one(folder: Path, settings: dict[str, Any], rival: list[str] | None) -> list
         str(n_frames),
         f"{100 * len(errors[-1]) / n_frames:.1f} %",
         str(track["summary"]["on_depth"]),
-        *(f"{trajectory_error.statistics(error)['rmse']:.4f}" for error in errors),
+        *(f"{trajectory_error.rmse(error):.4f}" for error in errors),
         f"{cpu:.1f}",
         of_rival(run, *rival) if rival else "",
     ]

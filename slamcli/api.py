@@ -215,10 +215,10 @@ class Run:
 
         frame : world, or level: z up, floor at z = 0
         """
-        from slamcli.evaluation import trajectory_error
+        from slamcli.evaluation import run_trajectories
         from slamcli.schema import Trajectory
 
-        found = trajectory_error.stage_trajectory(self.directory, stage or trajectory_error.last_stage(self.directory))
+        found = run_trajectories.stage_trajectory(self.directory, stage or run_trajectories.last_stage(self.directory))
         return Trajectory(stamp=found.stamp, T_wc=self.ground().T_lw @ found.T_wc) if frame == "level" else found
 
     def cloud(self) -> "Points":
@@ -260,21 +260,21 @@ class Run:
 
         truth : poses to compare with instead of the recording's true ones, such as another run's trajectory
         """
-        from slamcli.evaluation import trajectory_error
+        from slamcli.evaluation import run_trajectories, trajectory_error
 
-        stage = stage or trajectory_error.last_stage(self.directory)
-        truth = trajectory_error.ground_truth(self.directory) if truth is None else truth
+        stage = stage or run_trajectories.last_stage(self.directory)
+        truth = run_trajectories.ground_truth(self.directory) if truth is None else truth
         return trajectory_error.ape(
-            self.trajectory(stage), truth, n_frames=trajectory_error.frame_count(self.directory), name=self.name, stage=stage
+            self.trajectory(stage), truth, n_frames=run_trajectories.frame_count(self.directory), name=self.name, stage=stage
         )
 
     def rpe(self, stage: str | None = None, *, seconds: float | None = 1.0, truth: "Trajectory | None" = None) -> "Rpe":
         """Measure the relative pose error over an interval, or from one frame to the next where that is None; `truth` as for `ape`."""
-        from slamcli.evaluation import trajectory_error
+        from slamcli.evaluation import run_trajectories, trajectory_error
         from slamcli.schema import FrameTimes
 
-        stage = stage or trajectory_error.last_stage(self.directory)
-        truth = trajectory_error.ground_truth(self.directory) if truth is None else truth
+        stage = stage or run_trajectories.last_stage(self.directory)
+        truth = run_trajectories.ground_truth(self.directory) if truth is None else truth
         stamp = self.directory.load(FrameTimes, stage).stamp
         return trajectory_error.rpe(self.trajectory(stage), truth, frame_stamp=stamp, name=self.name, stage=stage, seconds=seconds)
 

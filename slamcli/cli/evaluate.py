@@ -101,14 +101,14 @@ def ape_command(
 
     Of a run of several recordings, first all together, then each under the same alignment; their truths must be told in one frame.
     """
-    from slamcli.evaluation import of_several, plots, tables, trajectory_error
+    from slamcli.evaluation import of_several, plots, run_trajectories, tables, trajectory_error
 
     results, rows = [], []
     for folder in _open_runs(runs, run):
-        true, n_frames = _truth(folder, truth, truth_offset), trajectory_error.frame_count(folder)
+        true, n_frames = _truth(folder, truth, truth_offset), run_trajectories.frame_count(folder)
         for name, which, estimate in _trajectories(folder, stage, other):
             results.append(trajectory_error.ape(estimate, true, n_frames=n_frames, name=name, stage=which))
-            rows.append(results[-1].to_dict() | trajectory_error.sure_figures(folder, results[-1]))
+            rows.append(results[-1].to_dict() | run_trajectories.sure_figures(folder, results[-1]))
             if which and folder.recordings:
                 rows[-1]["recordings"] = [_without_sure(one.to_dict()) for one in of_several.apes(folder, results[-1], true)]
             if which:
@@ -208,7 +208,7 @@ def _without_sure(figures: dict[str, Any]) -> dict[str, Any]:
 
 
 def _frame_stamp(folder: RunDir) -> np.ndarray:
-    from slamcli.evaluation.trajectory_error import last_stage
+    from slamcli.evaluation.run_trajectories import last_stage
     from slamcli.schema import FrameTimes
 
     return folder.load(FrameTimes, last_stage(folder)).stamp
@@ -216,12 +216,12 @@ def _frame_stamp(folder: RunDir) -> np.ndarray:
 
 def _trajectories(folder: RunDir, stage: str | None, other: tuple[str, ...]) -> list[tuple[str, str, Trajectory]]:
     """Return (name, stage, trajectory) of the run's stages asked for, then of other systems, whose stage is ""."""
-    from slamcli.evaluation import trajectory_error
+    from slamcli.evaluation import run_trajectories
     from slamcli.formats.trajectory import read_tum
 
-    last = trajectory_error.last_stage(folder)
+    last = run_trajectories.last_stage(folder)
     stages = WITH_TRAJECTORY[: WITH_TRAJECTORY.index(last) + 1] if stage == "all" else (stage or last,)
-    found = [(_label(folder), which, trajectory_error.stage_trajectory(folder, which)) for which in stages]
+    found = [(_label(folder), which, run_trajectories.stage_trajectory(folder, which)) for which in stages]
     for item in _of_one_recording(folder, other, "--other"):
         name, equals, file = item.partition("=")
         if not (name and equals and file):
@@ -259,11 +259,11 @@ def _truth(folder: RunDir, file: Path | None, offset: float) -> Trajectory:
     """Read the true trajectory, from `file` or of the recording, its stamps moved by `offset` [s]."""
     from dataclasses import replace
 
-    from slamcli.evaluation import trajectory_error
+    from slamcli.evaluation import run_trajectories
     from slamcli.formats.trajectory import read_tum
 
     given = _of_one_recording(folder, [file] if file is not None else [], "--truth")
-    truth = read_tum(given[0]) if given else trajectory_error.ground_truth(folder)
+    truth = read_tum(given[0]) if given else run_trajectories.ground_truth(folder)
     return replace(truth, stamp=truth.stamp + offset)
 
 

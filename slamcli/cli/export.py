@@ -59,7 +59,7 @@ def export_trajectory(
       slamcli export-trajectory base.txt --frame level --mount 0.1,0,0.3,0,0.2,0
       slamcli export-trajectory monday.txt --recording monday -r runs/house
     """
-    from slamcli.evaluation import of_several, trajectory_error
+    from slamcli.evaluation import of_several, run_trajectories
     from slamcli.formats import trajectory as trajectory_file
     from slamcli.runs.run_directory import RunDir
     from slamcli.schema import Trajectory
@@ -71,15 +71,15 @@ def export_trajectory(
         _export_graph(out, folder, is_plain=is_plain, as_json=as_json)
         return
     format_name = format_name or FORMAT_OF[ending]
-    trajectory = trajectory_error.stage_trajectory(folder, stage or trajectory_error.last_stage(folder))
+    trajectory = run_trajectories.stage_trajectory(folder, stage or run_trajectories.last_stage(folder))
     if sure_only:
-        trajectory = trajectory_error.sure_part(folder, trajectory)
+        trajectory = run_trajectories.sure_part(folder, trajectory)
     if recording is not None:
         trajectory = of_several.part(folder, recording, trajectory)
     T_wc = told_in(folder, trajectory.T_wc, frame, mount)
     trajectory_file.writer(format_name)(out, Trajectory(stamp=trajectory.stamp, T_wc=T_wc))
     n = len(trajectory.stamp)
-    n_frames = trajectory_error.frame_count(folder) if recording is None else of_several.frame_count(folder, recording)
+    n_frames = run_trajectories.frame_count(folder) if recording is None else of_several.frame_count(folder, recording)
     note = "; a KITTI file has no stamps, so its lines are not frame numbers here" if format_name == "kitti" and n < n_frames else ""
     tell_written(out, as_json, f"{n} poses of {n_frames} frames{note}", poses=n, frames=n_frames, frame=frame, format=format_name)
 

@@ -96,7 +96,7 @@ def report(run: str | None, out: Path | None, with_inspection: bool) -> None:
     The page is one file: it needs no network and no folder beside it.
     """
     from slamcli import report as report_page
-    from slamcli.evaluation.trajectory_error import last_stage
+    from slamcli.evaluation.run_trajectories import last_stage
     from slamcli.runs.run_directory import RunDir
 
     folder = RunDir.find(run)

@@ -9,7 +9,7 @@ import numpy as np
 from slamcli.datasets.association import associate
 from slamcli.dense import occupancy
 from slamcli.errors import BadFrame
-from slamcli.evaluation import grid_truth, trajectory_error
+from slamcli.evaluation import grid_truth, run_trajectories, trajectory_error
 from slamcli.formats import octomap
 from slamcli.geometry import se3
 from slamcli.navigation import grid
@@ -52,8 +52,8 @@ def grid_score(run: RunDir, *, progress: Progress) -> dict[str, Any]:
     """Compare the grid with the scene: shares of cells right, and whether the special boxes are in it."""
     dataset, camera, settings = run.dataset(), run.camera("loop"), run.config().grid2d
     scene, cells = grid_truth.read_scene(_scene_file(run)), run.load(Grid, "grid2d")
-    times, T_lw, truth = run.load(FrameTimes, "loop"), run.load(Ground, "densify").T_lw, trajectory_error.ground_truth(run)
-    aligned = trajectory_error.ape(trajectory_error.stage_trajectory(run, "loop"), truth, n_frames=len(times.stamp), name=str(run.path))
+    times, T_lw, truth = run.load(FrameTimes, "loop"), run.load(Ground, "densify").T_lw, run_trajectories.ground_truth(run)
+    aligned = trajectory_error.ape(run_trajectories.stage_trajectory(run, "loop"), truth, n_frames=len(times.stamp), name=str(run.path))
     T_sl = aligned.T_gw @ se3.inverse(T_lw)  # a simulated recording's truth is given in its scene's frame
     T_lc = T_lw @ frame_poses(run.load(Tracks, "loop"), run.load(Map, "loop"))
     frames = grid.spaced(T_lc, metres=settings.spacing, degrees=settings.spacing_deg)

@@ -8,7 +8,7 @@ import numpy as np
 
 from slamcli import files
 from slamcli.errors import SlamError
-from slamcli.evaluation.trajectory_error import Ape, Rpe, statistics
+from slamcli.evaluation.trajectory_error import Ape, Rpe, rmse, statistics
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8c6d31")  # told apart by colour-blind eyes too
 TRUTH_COLOUR = "#555555"
@@ -23,7 +23,7 @@ def plot_ape(results: Sequence[Ape], path: Path) -> None:
     over_time = figure.add_subplot(rows[0, :])
     start = min(result.stamp[0] for result in results)
     for colour, result in zip(_colours(results), results, strict=True):
-        label = f"{label_of(result)}: RMSE {statistics(result.error)['rmse']:.4f} m, {100 * result.coverage:.1f} % of frames"
+        label = f"{label_of(result)}: RMSE {result.rmse:.4f} m, {100 * result.coverage:.1f} % of frames"
         over_time.plot(*_with_gaps(result.stamp, result.stamp - start, result.error), color=colour, lw=1.1, label=label)
         if len(results) == 1:
             for name, style in (("rmse", "-"), ("mean", "--"), ("median", ":")):
@@ -42,9 +42,9 @@ def plot_rpe(results: Sequence[Rpe], path: Path) -> None:
     start = min(result.stamp[0] for result in results)
     for colour, result in zip(_colours(results), results, strict=True):
         t = result.stamp - start
-        label = f"{label_of(result)}: RMSE {statistics(result.translation)['rmse']:.4f} m"
+        label = f"{label_of(result)}: RMSE {rmse(result.translation):.4f} m"
         translation.plot(*_with_gaps(result.stamp, t, result.translation), color=colour, lw=1.0, label=label)
-        label = f"{label_of(result)}: RMSE {statistics(result.rotation_deg)['rmse']:.3f} deg"
+        label = f"{label_of(result)}: RMSE {rmse(result.rotation_deg):.3f} deg"
         rotation.plot(*_with_gaps(result.stamp, t, result.rotation_deg), color=colour, lw=1.0, label=label)
     interval = f"{results[0].delta:g} {results[0].unit}"
     _finish(translation, "", f"translation error over {interval} [m]", from_zero=True)

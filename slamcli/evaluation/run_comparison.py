@@ -8,7 +8,7 @@ import numpy as np
 
 from slamcli.config import toml
 from slamcli.errors import Damaged, SlamError
-from slamcli.evaluation import map_verdict, trajectory_error
+from slamcli.evaluation import map_verdict, run_trajectories, trajectory_error
 from slamcli.evaluation.map_verdict import Verdict
 from slamcli.formats import cloud
 from slamcli.runs.run_directory import RunDir
@@ -65,7 +65,7 @@ def differing_settings(configs: Sequence[dict[str, Any]]) -> list[dict[str, Any]
 
 def _compared(run: RunDir, name: str, settings: dict[str, Any], first: dict[str, Any], reference: RunDir) -> ComparedRun:
     records = {stage: record for stage in NAMES if (record := run.record(stage)) is not None}
-    estimate = trajectory_error.stage_trajectory(run, trajectory_error.last_stage(run))
+    estimate = run_trajectories.stage_trajectory(run, run_trajectories.last_stage(run))
     return ComparedRun(
         name=name,
         settings=settings,
@@ -73,7 +73,7 @@ def _compared(run: RunDir, name: str, settings: dict[str, Any], first: dict[str,
         seconds=sum(record["seconds"] - record["compile_seconds"] for record in records.values()),
         cpu_seconds=sum(record["cpu_seconds"] - record["compile_seconds"] for record in records.values()),
         ape=_ape(run, name),
-        frames=trajectory_error.frame_count(run),
+        frames=run_trajectories.frame_count(run),
         located=len(estimate.stamp),
         verdict=map_verdict.of_run(run),
         difference=None if run is reference else map_difference(run, reference),
@@ -82,15 +82,15 @@ def _compared(run: RunDir, name: str, settings: dict[str, Any], first: dict[str,
 
 def _ape(run: RunDir, name: str) -> float | None:
     try:
-        truth, stage = trajectory_error.ground_truth(run), trajectory_error.last_stage(run)
+        truth, stage = run_trajectories.ground_truth(run), run_trajectories.last_stage(run)
         found = trajectory_error.ape(
-            trajectory_error.stage_trajectory(run, stage), truth, n_frames=trajectory_error.frame_count(run), name=name, stage=stage
+            run_trajectories.stage_trajectory(run, stage), truth, n_frames=run_trajectories.frame_count(run), name=name, stage=stage
         )
     except Damaged:
         raise
     except SlamError:  # no truth, too few poses, or the recording is gone: there is nothing to compare with
         return None
-    return trajectory_error.statistics(found.error)["rmse"]
+    return found.rmse
 
 
 def map_difference(run: RunDir, other: RunDir) -> MapDifference:

@@ -8,7 +8,7 @@ import numpy as np
 from slamcli import schema
 from slamcli.datasets import Dataset
 from slamcli.errors import Damaged, SlamError
-from slamcli.evaluation import map_verdict, of_several, trajectory_error
+from slamcli.evaluation import map_verdict, of_several, run_trajectories, trajectory_error
 from slamcli.evaluation.map_verdict import Verdict
 from slamcli.evaluation.trajectory_error import Ape
 from slamcli.geometry import se3
@@ -89,7 +89,7 @@ class Content:
 
 def collect(run: RunDir, dataset: Dataset | None = None) -> Content:
     """Gather a run; it may have ended after any stage from track on. `dataset` : its recording, where it is open already."""
-    stage = trajectory_error.last_stage(run)
+    stage = run_trajectories.last_stage(run)
     times, map_, tracks = run.load(FrameTimes, stage), run.load(Map, stage), run.load(Tracks, stage)
     ground = run.load(Ground, "densify") if run.record("densify") is not None else None
     T_lw = ground.T_lw if ground is not None else UPRIGHT
@@ -152,7 +152,7 @@ def _ape(run: RunDir, stamp: np.ndarray, truth: Trajectory | None) -> dict[str, 
         if run.record(stage) is not None:
             try:
                 found[stage] = trajectory_error.ape(
-                    trajectory_error.stage_trajectory(run, stage), truth, n_frames=len(stamp), name=stage, stage=stage
+                    run_trajectories.stage_trajectory(run, stage), truth, n_frames=len(stamp), name=stage, stage=stage
                 )
             except Damaged:
                 raise

@@ -16,9 +16,7 @@ import numpy as np
 from slamcli.datasets.association import MAX_DIFFERENCE, associate
 from slamcli.errors import SlamError
 from slamcli.geometry import se3
-from slamcli.hints import hint
-from slamcli.schema import Doubt, FrameTimes, Map, Tracks, Trajectory, trajectory
-from slamcli.stages import WITH_TRAJECTORY
+from slamcli.schema import Trajectory
 
 RPE_SECONDS = 1.0  # [s] interval over which drift is measured
 RPE_TOLERANCE = 0.1  # share of that interval by which a pair may miss it, as in evo
@@ -42,8 +40,8 @@ class Ape:
 
     @property
     def rmse(self) -> float:
-        """Return the root of the mean squared error [m]; [Z] (16)."""
-        return float(np.sqrt(np.mean(self.error**2)))
+        """Return the root of the mean squared error [m]."""
+        return rmse(self.error)
 
     @property
     def coverage(self) -> float:
@@ -98,63 +96,21 @@ class Rpe:
         }
 
 
+def rmse(error: np.ndarray) -> float:
+    """Compute the root of the mean squared error, [Z] (16), of errors (N,)."""
+    return float(np.sqrt(np.mean(np.square(error))))
+
+
 def statistics(error: np.ndarray) -> dict[str, float]:
-    """Summarize errors (N,); [Z] (16) is `rmse`."""
+    """Summarize errors (N,)."""
     return {
-        "rmse": float(np.sqrt(np.mean(np.square(error)))),
+        "rmse": rmse(error),
         "mean": float(np.mean(error)),
         "median": float(np.median(error)),
         "std": float(np.std(error)),
         "min": float(np.min(error)),
         "max": float(np.max(error)),
     }
-
-
-def last_stage(run: Any) -> str:
-    """Name the last stage of a run that holds a trajectory."""
-    for stage in reversed(WITH_TRAJECTORY):
-        if run.record(stage) is not None:
-            return stage
-    raise SlamError(f"{run.path}: no stage has made a trajectory yet; try: {hint().update(run.path, until='track')}")
-
-
-def stage_trajectory(run: Any, stage: str) -> Trajectory:
-    """Return the poses of all frames that have one after a stage."""
-    return trajectory(run.load(FrameTimes, stage).stamp, run.load(Tracks, stage), run.load(Map, stage))
-
-
-def sure_part(run: Any, whole: Trajectory) -> Trajectory:
-    """Leave out of a run's trajectory the frames whose poses its loop stage doubts; SlamError where that has not been run."""
-    stamp, doubts = run.load(FrameTimes, "loop").stamp, run.load(Doubt, "loop")
-    is_sure = ~np.isin(whole.stamp, stamp[doubts.is_doubtful])
-    return Trajectory(stamp=whole.stamp[is_sure], T_wc=whole.T_wc[is_sure])
-
-
-def sure_figures(run: Any, found: Ape) -> dict[str, Any]:
-    """Count the frames that a run doubts, and give the RMSE [m] of the others; None where another stage's or system's poses were measured."""
-    if found.stage != "loop":
-        return {"doubtful": None, "rmse_sure": None}
-    doubts = run.load(Doubt, "loop")
-    error = found.error[~np.isin(found.stamp, run.load(FrameTimes, "loop").stamp[doubts.is_doubtful])]
-    return {"doubtful": int(doubts.is_doubtful.sum()), "rmse_sure": float(np.sqrt((error**2).mean())) if len(error) else None}
-
-
-def frame_count(run: Any) -> int:
-    """Count the colour frames of a run's recording, as any of its stages knows them."""
-    records = (run.record(stage) for stage in ("extract", *reversed(WITH_TRAJECTORY)))
-    return next(int(record["summary"]["frames"]) for record in records if record is not None)
-
-
-def ground_truth(run: Any) -> Trajectory:
-    """Return the true trajectory of a run's recording; SlamError when there is none."""
-    dataset = run.dataset()
-    truth = dataset.ground_truth()
-    if truth is None:
-        raise SlamError(
-            f"{dataset.root}: no ground truth, so there is nothing to compare with; "
-            f"put a groundtruth.txt (timestamp tx ty tz qx qy qz qw) there, give one with {hint().argument('truth')}, or look at the result with: {hint().report(run.path)}"
-        )
-    return truth
 
 
 def matched_pair(estimate: Trajectory, truth: Trajectory, *, name: str) -> tuple[Trajectory, Trajectory]:
@@ -207,7 +163,7 @@ def ape(estimate: Trajectory, truth: Trajectory, *, n_frames: int, name: str, st
         x_aligned=aligned.T_wc[:, :3, 3],
         T_gw=T_gw,
         scale=scale,
-        rmse_scaled=statistics(error["scaled"])["rmse"],
+        rmse_scaled=rmse(error["scaled"]),
     )
 
 

@@ -171,4 +171,4 @@ def _located(content: Content) -> str:
     length = float(np.nansum(np.linalg.norm(np.diff(content.path, axis=0), axis=1)))
     text = f"{n_poses} of {n} frames located along {length:.1f} m in {content.seconds:.1f} s"
     ape = content.ape.get(content.stage)
-    return f"{text}; {1000 * float(np.sqrt(np.mean(ape.error**2))):.1f} mm from the truth (RMS)" if ape else text
+    return f"{text}; {1000 * ape.rmse:.1f} mm from the truth (RMS)" if ape else text

@@ -9,7 +9,7 @@ from recordings import write_recording
 
 from slamcli.datasets import open_dataset
 from slamcli.errors import SlamError
-from slamcli.evaluation import trajectory_error
+from slamcli.evaluation import run_trajectories
 from slamcli.formats.trajectory import read_tum
 from slamcli.geometry import se3
 from slamcli.runs import localization
@@ -32,7 +32,7 @@ def test_frames_are_found_where_the_run_has_them(slamcli, room, room_run, tmp_pa
     before = {path: path.stat().st_mtime_ns for path in room_run.rglob("*")}
     told = slamcli("localize", room_run, again, "--out", out, "--json")
     figures = json.loads(told.stdout)
-    found, own = read_tum(out), trajectory_error.stage_trajectory(RunDir(room_run), "loop")
+    found, own = read_tum(out), run_trajectories.stage_trajectory(RunDir(room_run), "loop")
     assert figures["coverage"] == 1.0 and figures["n_poses"] == len(found.stamp) == 20
     np.testing.assert_allclose(found.stamp - 3600, own.stamp[::2], atol=1e-5)
     apart = se3.log(se3.inverse(own.T_wc[::2]) @ found.T_wc)  # in the run's own frame: nothing is aligned

@@ -15,7 +15,7 @@ from slamcli.config.options import Config
 from slamcli.datasets import open_dataset, silent
 from slamcli.datasets.simulate import simulate
 from slamcli.errors import SlamError
-from slamcli.evaluation import trajectory_error
+from slamcli.evaluation import run_trajectories, trajectory_error
 from slamcli.formats.trajectory import read_tum
 from slamcli.geometry import se3
 from slamcli.runs import several
@@ -72,7 +72,7 @@ def test_what_overlaps_lies_in_one_frame(house: RunDir) -> None:
     found = counts(house)
     assert [found[name]["located"] for name in ("room", "again")] == [40, 40]
     together = trajectory_error.ape(
-        trajectory_error.stage_trajectory(house, "loop"), trajectory_error.ground_truth(house), n_frames=110, name="house"
+        run_trajectories.stage_trajectory(house, "loop"), run_trajectories.ground_truth(house), n_frames=110, name="house"
     )
     assert len(together.stamp) == 80
     assert 0.0005 < together.rmse < 0.02  # 160 pixels across, by two cameras
@@ -126,7 +126,7 @@ def test_a_trajectory_is_told_in_its_recordings_own_stamps(house: RunDir, slamcl
     found, file = read_tum(tmp_path / "t.txt"), read_tum(house.path / "loop" / "trajectory_again.txt")
     np.testing.assert_allclose(found.stamp, own, atol=1e-6)
     np.testing.assert_array_equal(found.T_wc, file.T_wc)
-    whole = trajectory_error.stage_trajectory(house, "loop")
+    whole = run_trajectories.stage_trajectory(house, "loop")
     np.testing.assert_allclose(found.T_wc, whole.T_wc[:40], atol=1e-8)  # it is the first: names decide where clocks do not
     unknown = slamcli("export-trajectory", tmp_path / "u.txt", "--recording", "attic", "-r", house.path)
     assert unknown.exit_code == 1 and "its recordings are again, elsewhere, room" in unknown.output
@@ -195,7 +195,7 @@ def test_added_recordings_leave_the_world_where_it_was(grown: RunDir, room_run: 
 
 def test_an_added_recording_is_as_good_as_one_named_at_once(grown: RunDir, house: RunDir) -> None:
     rmse = [
-        trajectory_error.ape(trajectory_error.stage_trajectory(run, "loop"), trajectory_error.ground_truth(run), n_frames=80, name="").rmse
+        trajectory_error.ape(run_trajectories.stage_trajectory(run, "loop"), run_trajectories.ground_truth(run), n_frames=80, name="").rmse
         for run in (grown, house)
     ]
     assert rmse[0] == pytest.approx(rmse[1], rel=0.1)
@@ -272,8 +272,8 @@ def test_what_is_gone_in_a_later_recording_fades_from_every_map(tmp_path: Path) 
     inside = {}
     for name, targets in (("alone", [before]), ("both", [before, after])):
         run = made(targets, tmp_path / name, until="octree")
-        truth, stage = trajectory_error.ground_truth(run), "loop"
-        aligned = trajectory_error.ape(trajectory_error.stage_trajectory(run, stage), truth, n_frames=80, name=name)
+        truth, stage = run_trajectories.ground_truth(run), "loop"
+        aligned = trajectory_error.ape(run_trajectories.stage_trajectory(run, stage), truth, n_frames=80, name=name)
         assert aligned.rmse < 0.02
         T_sl = aligned.T_gw @ se3.inverse(api.Run(run).ground().T_lw)
         tree = api.Run(run).octree()
