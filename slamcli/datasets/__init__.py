@@ -10,6 +10,7 @@ from slamcli.console import Progress, silent
 from slamcli.datasets.assembly import assemble
 from slamcli.datasets.protocol import Dataset
 from slamcli.datasets.readers import READERS, reader_of
+from slamcli.datasets.unknown_folder import describe
 from slamcli.errors import SlamError
 from slamcli.files import user_path
 from slamcli.hints import hint
@@ -59,7 +60,8 @@ def _not_a_recording(path: Path) -> str:
     if not path.is_dir():
         return f"{path}: a device or a pipe; give the folder of a recording, or a file of a kind that opens (see: {hint().layouts()})"
     inner = [entry.name for entry in sorted(path.iterdir()) if entry.is_dir() and reader_of(entry) is not None]
-    found = f"; recordings are in it: {', '.join(inner[:3])}" if inner else ""
+    seen = "" if inner else describe(path)
+    found = f"; recordings are in it: {', '.join(inner[:3])}" if inner else f"; {seen}" if seen else ""
     return f"{path}: not a recording{found}; see what opens and how it is told: {hint().layouts()}"
 
 
