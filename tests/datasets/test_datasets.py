@@ -65,7 +65,7 @@ def test_user_mistakes_are_told(tmp_path: Path) -> None:
     (tmp_path / "archive.tgz").write_bytes(b"x")
     for target, data, said in [
         ("archive.tgz", None, "an archive; unpack it"),
-        ("fr1_x", str(tmp_path / "none"), "--data .* no such folder"),
+        ("fr1_x", str(tmp_path / "none"), "data .* no such folder"),
         ("", None, "no recording named"),
         ("tum/fr9_x", None, "no such recording"),
     ]:
