@@ -147,6 +147,7 @@ def test_outside_the_grid_is_unknown():
     ("start", "goal", "says"),
     [
         ((9.0, 1.0), (1.0, 1.0), r"start 9,1: outside the grid, which covers x 0\.00 to 4\.00 m, y 0\.00 to 5\.00 m"),
+        ((4.5, 1.0), (1.0, 1.0), r"start 4\.5,1: outside"),  # beyond in x, though not in y, which goes further
         ((1.0, 1.0), (1.0, -0.1), r"goal 1,-0\.1: outside"),
         ((1.0, 2.52), (1.0, 1.0), r"start 1,2\.52: inside an obstacle; the nearest place with room for the robot is "),
         ((1.0, 1.0), (1.0, 2.4), r"goal 1,2\.4: nearer than the robot's radius of 0\.2 m"),

@@ -56,7 +56,8 @@ def test_much_new_surface_asks_for_one_whoever_stands_there(n_crowd: int):
     new = replace(CALM, n_near_landmarks=FEW_NEAR_LANDMARKS - 1, n_near_new=MANY_NEAR_FEATURES + 1, n_crowd=n_crowd)
     assert by_landmarks(new, SETTINGS) == NEW_SURFACE
     assert not by_landmarks(replace(new, n_near_landmarks=FEW_NEAR_LANDMARKS), SETTINGS)
-    assert not by_landmarks(replace(new, n_near_new=MANY_NEAR_FEATURES), SETTINGS)
+    for few in (MANY_NEAR_FEATURES, MANY_NEAR_FEATURES // 2):
+        assert not by_landmarks(replace(new, n_near_new=few), SETTINGS)
 
 
 def test_without_depth_there_is_nothing_to_make_landmarks_of():
@@ -72,6 +73,8 @@ def test_without_depth_there_is_nothing_to_make_landmarks_of():
         ([0, 0, 0.32, 0, 0, 0], 0.8, HAS_MOVED),
         ([0.2, 0.2, 0.2, 0, 0, 0], 0.8, HAS_MOVED),  # 0.35 m
         ([0, 0, 0, 0, np.radians(16.0), 0], 0.8, HAS_MOVED),
+        ([0, 0, 0, np.radians(16.0), 0, 0], 0.8, HAS_MOVED),
+        ([0, 0, 0, 0, 0, np.radians(16.0)], 0.8, HAS_MOVED),
         ([0, 0, 0, 0, 0, 0], 0.75, ""),
         ([0, 0, 0, 0, 0, 0], 0.74, LEAVES_REFERENCE),
     ],

@@ -217,3 +217,20 @@ def test_the_map_comes_to_its_optimum_once(monkeypatch, is_refined, tolerance):
     rounds.truth[59, 0, 3] += 0.02  # where the closure says that it is
     rounds.closer.close_loops(silent)
     assert given == [tolerance]
+
+
+@pytest.mark.parametrize("axis", range(6))
+def test_one_key_frame_that_moves_more_than_a_little_along_or_about_any_axis_has_moved(axis: int) -> None:
+    before = np.tile(np.eye(4), (5, 1, 1))
+    least = loop_closing.SETTLED_M if axis < 3 else loop_closing.SETTLED_RAD
+    for part, expected in ((0.98, False), (1.02, True), (-1.02, True)):
+        twist = np.zeros((5, 6))
+        twist[3, axis] = part * least
+        assert loop_closing.has_moved(before, before @ se3.exp(twist)) == expected
+
+
+def test_little_motions_do_not_add_up() -> None:
+    """Neither those of many key frames, nor a shift and a turn of one."""
+    before = np.tile(np.eye(4), (100, 1, 1))
+    shift, turn = loop_closing.SETTLED_M, loop_closing.SETTLED_RAD
+    assert not loop_closing.has_moved(before, before @ se3.exp(np.tile([0.95 * shift, 0, 0, 0.95 * turn, 0, 0], (100, 1))))
