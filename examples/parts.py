@@ -62,7 +62,7 @@ def track(run: slamcli.Run, n_frames: int = 40) -> tuple[Tracks, Map]:
     return tracks, map_
 
 
-def close_loops(run: slamcli.Run, map_: Map) -> Map:
+def close_loops(run: slamcli.Run, map_: Map) -> None:
     """Look for places that the map shows twice, and move it so that they coincide."""
     config = run.config()
     features, words = run.directory.load(Features, "extract"), run.directory.load(Words, "match")
@@ -77,7 +77,6 @@ def close_loops(run: slamcli.Run, map_: Map) -> Map:
     line("n_matches, n_inliers", f"{[(c.n_matches, c.n_inliers) for c in tried]}, by which each was verified")
     line("reason, T_ij", f"{sum(c.is_accepted for c in tried)} are accepted, and have no reason against them: {[c.reason for c in tried]}")
     line("T_wk", f"key frames moved by {1000 * max(map(apart, closed.T_wk, map_.T_wk)):.1f} mm at most")
-    return closed
 
 
 def align(run: slamcli.Run, tracks: Tracks, map_: Map) -> None:

@@ -306,7 +306,7 @@ def _registered(
     camera = _told_by_map(camera, dataset, config)
     registered = replace(config, recording=replace(config.recording, depth_camera=camera.option))
     opened, dataset, _ = reopen(resolve=lambda config: registered)
-    told = f"{camera.told}; {hint().setting('recording.find_depth_camera', 'false')} leaves depth as it is"
+    told = f"{camera.told}; {hint().setting('recording.find_depth_camera', False)} leaves depth as it is"
     log.warning("%s: %s", dataset.root, told)
     others = [finding for finding in found if finding.name != "registration"]
     return opened, dataset, registered, [*others, Finding("depth_camera", told)]

@@ -38,9 +38,9 @@ class Hints:
         """Name an option, such as recording.fps, so that one knows how to give it."""
         return name
 
-    def setting(self, name: str, value: object = "...") -> str:
-        """Write an option with a value, as it is given for a run."""
-        return f'settings={{"{name}": {value}}}'
+    def setting(self, name: str, value: bool | float | None = None) -> str:
+        """Write an option with a value, as it is given for a run; dots for a value that the user knows."""
+        return f'settings={{"{name}": {"..." if value is None else repr(value)}}}'
 
     def options(self) -> str:
         """List the options there are."""
@@ -118,9 +118,10 @@ class ShellHints(Hints):
         """Name the flag that sets the option, or all set options' with its name."""
         return FLAGS_OF_OPTIONS.get(name, f"-s {name}=...")
 
-    def setting(self, name: str, value: object = "...") -> str:
-        """Write the flag with option and value."""
-        return f"-s {name}={value}"
+    def setting(self, name: str, value: bool | float | None = None) -> str:
+        """Write the flag with option and value, as TOML has it."""
+        shown = "..." if value is None else str(value).lower() if isinstance(value, bool) else f"{value:g}"
+        return f"-s {name}={shown}"
 
     def options(self) -> str:
         """Explain the options."""

@@ -18,6 +18,7 @@ import slamcli
 from slamcli import api
 from slamcli.cli.main import cli
 from slamcli.config import toml
+from slamcli.config.options import Config
 from slamcli.errors import SlamError
 from slamcli.hints import FLAGS, FLAGS_OF_OPTIONS, Hints, ShellHints, hint, run_flag, spoken
 
@@ -112,3 +113,16 @@ def test_hints_are_given_back_after_an_error() -> None:
         assert hint().update(RUN) == f"slamcli run {run_flag(RUN)}"
         raise SlamError("")
     assert hint().update(RUN) == "slamcli.open_run('runs/front room').update()"
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("recording.find_depth_camera", False), ("camera.depth_scale", 1000.0), ("track.min_inliers", 20)]
+)
+def test_a_setting_can_be_given_as_it_is_advised(name: str, value: float) -> None:
+    in_python = eval(f"dict({Hints().setting(name, value)})")["settings"]  # what the message says, and nothing else
+    flag, assignment = shlex.split(ShellHints().setting(name, value))
+    assert flag == FLAGS["settings"]
+    for settings in (in_python, [assignment]):
+        assert toml.to_dict(toml.resolve(Config(), None, settings), [name]) == toml.to_dict(
+            toml.resolve(Config(), None, {name: value}), [name]
+        )

@@ -217,7 +217,7 @@ def _told(gap: Gap) -> str:
     x, y = gap.xy
     if gap.is_unseen:
         return f"a gap of {gap.width:.2f} m at {x:.2f},{y:.2f}, beside cells that were never seen: look there, or try --allow-unknown"
-    return f"a gap of {gap.width:.2f} m at {x:.2f},{y:.2f}, beside an obstacle"
+    return f"a gap of {gap.width:.2f} m at {x:.2f},{y:.2f}, between obstacles"
 
 
 def _gap_before(grid: Grid, start: tuple[float, float], goal: tuple[float, float], radius: float, allow_unknown: bool) -> Gap | None:

@@ -16,6 +16,7 @@ from slamcli.jit.kernel import kernel
 OVERLAP = 1.1  # by which the footprints of neighbouring readings overlap, so that a slanted surface shows no holes
 PATH_REACH = 0.1  # of a point's depth, by which the offset of the cameras may move it on a path that is a cubic
 SURFACE = 0.03  # relative difference up to which neighbouring readings are of one surface
+LEAST_FACING = 0.5  # cosine between the cameras' axes, from which on a step between pixels tells one between readings
 REACH = 2  # [px] on either side, over which a surface's slope is measured: over fewer the noise of two readings would count as slope
 
 
@@ -70,6 +71,14 @@ class Registration:
         powers = inverse(np.stack([nearness**n for n in range(4)], axis=1))
         return np.ascontiguousarray(product(powers, pixel.reshape(4, -1)).reshape(pixel.shape).transpose(1, 3, 0, 2).astype(np.float32))
 
+    @cached_property
+    def _back(self) -> np.ndarray:
+        """Return what takes steps between pixels to steps between readings, (2, 2) as in `ToColour`; zeros, and so no slope, beyond LEAST_FACING."""
+        if self.T_cd[2, 2] < LEAST_FACING:
+            return np.zeros((2, 2))
+        to, of = self.colour_camera, self.depth_camera
+        return inverse(self.T_cd[:2, :2] * np.array([to.fx, to.fy])[:, None] / np.array([of.fx, of.fy]))
+
     def apply(self, depth: np.ndarray) -> np.ndarray:
         """Return depth (h, w) float32 [m] of the depth camera as the colour camera would see it, (H, W) float32, NaN = none.
 
@@ -80,12 +89,11 @@ class Registration:
         to = self.colour_camera
         out, away = (np.full((to.height, to.width), np.inf, dtype=np.float32) for _ in range(2))
         magnification = np.array([to.fx / self.depth_camera.fx, to.fy / self.depth_camera.fy])
-        back = inverse(self.T_cd[:2, :2] * np.array([to.fx, to.fy])[:, None] / np.array([self.depth_camera.fx, self.depth_camera.fy]))
         lens = 2 if to.lens == EQUIDISTANT else 3 if to.is_rational else 1 if to.is_distorted else 0
         intrinsics = np.array([to.fx, to.fy, to.cx, to.cy])
         to_colour = ToColour(
             self._ray, self.T_cd[:3, 3].copy(), intrinsics, lens, to.coefficients, self._near, self._path,
-            half=0.5 * OVERLAP * magnification, back=back,
+            half=0.5 * OVERLAP * magnification, back=self._back,
         )  # fmt: skip
         splat(np.ascontiguousarray(depth), to_colour, out, away)
         return out
@@ -133,18 +141,18 @@ def measure_rises(depth: f4[:, ::1], i: i8, across: f4[::1], down: f4[::1]):
     across, down : (w,), zeros before the first row
     """
     rows, columns = depth.shape
-    bend, tilt, step = f4(SURFACE), f4(2 * REACH * SURFACE), f4(1.0 / (2 * REACH))
+    straight, steep, step = f4(SURFACE), f4(2 * REACH * SURFACE), f4(1.0 / (2 * REACH))
     for j in range(REACH, columns - REACH):  # without a branch: several pixels a step
         d, left, right = depth[i, j], depth[i, j - REACH], depth[i, j + REACH]
         rise = right - left
-        across[j] = rise * step if (abs(left + right - d - d) <= bend * d) & (abs(rise) <= tilt * d) else f4(0.0)
+        across[j] = rise * step if (abs(left + right - d - d) <= straight * d) & (abs(rise) <= steep * d) else f4(0.0)
     if i < REACH or i >= rows - REACH:
         down[:] = 0.0
         return
     for j in range(columns):
         d, above, below = depth[i, j], depth[i - REACH, j], depth[i + REACH, j]
         rise = below - above
-        down[j] = rise * step if (abs(above + below - d - d) <= bend * d) & (abs(rise) <= tilt * d) else f4(0.0)
+        down[j] = rise * step if (abs(above + below - d - d) <= straight * d) & (abs(rise) <= steep * d) else f4(0.0)
 
 
 @kernel(error_model="numpy")
@@ -191,14 +199,14 @@ def splat(depth: f4[:, ::1], to: ToColour, out: f4[:, ::1], away: f4[:, ::1]):
             top, bottom = int(v - half_v + 1.0), min(int(v + half_v), rows - 1)
             reading = f4(z)
             before, beside = f4(reading * (1.0 + SURFACE)), f4(reading * (1.0 - SURFACE))
-            at_u, at_v, tilt_u, tilt_v = f4(u), f4(v), slope_u[j], slope_v[j]
+            at_u, at_v, rise_u, rise_v = f4(u), f4(v), slope_u[j], slope_v[j]
             for row in range(top, bottom + 1):
                 below = f4(row) - at_v
                 for column in range(left, right + 1):
                     there, beyond = out[row, column], f4(column) - at_u
                     aside = beyond * beyond + below * below
                     if before < there or (beside <= there and aside < away[row, column]):
-                        out[row, column], away[row, column] = reading + tilt_u * beyond + tilt_v * below, aside
+                        out[row, column], away[row, column] = reading + rise_u * beyond + rise_v * below, aside
     for row in range(rows):
         for column in range(columns):
             if out[row, column] == np.inf:

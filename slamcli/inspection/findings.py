@@ -198,7 +198,7 @@ def about_unit(dataset: Dataset, unit: DepthUnit) -> list[RecordingFinding]:
         return []
     message = f"the depth scale {dataset.camera.depth_scale:g} is doubtful: {unit.reason}"
     level = WARNING if unit.q is not None and not unit.camera else ERROR  # a camera may be new
-    return [RecordingFinding(level, "depth scale", message, f"try: {hint().setting('camera.depth_scale', f'{unit.likely_scale:g}')}")]
+    return [RecordingFinding(level, "depth scale", message, f"try: {hint().setting('camera.depth_scale', unit.likely_scale)}")]
 
 
 def about_focal_length(dataset: Dataset, rigid: Rigidity | None) -> list[RecordingFinding]:

@@ -12,6 +12,7 @@ from slamcli.navigation.rooms import DOOR_WIDTH, LEAST_AREA, Room, find_rooms, r
 from slamcli.navigation.walls import Wall
 from slamcli.schema import Grid
 
+JAMB = 2.0  # cells beyond half of a gap's width, within which what bounds it lies
 WORTH_A_WORD = 0.5  # [m^2] of free floor in one piece that is out of reach
 
 
@@ -21,7 +22,7 @@ class Gap:
 
     xy: tuple[float, float]  # [m], level frame
     width: float  # [m]
-    is_unseen: bool  # beside cells that were never seen; else beside an obstacle
+    is_unseen: bool  # on one side at least by cells that were never seen, so that it may be wider; else between obstacles
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values."""
@@ -112,11 +113,11 @@ def widest_gap(grid: Grid, start: tuple[float, float], beyond: np.ndarray, *, ra
     least, wider = np.append(widths, np.inf)[n_wide_enough - 1 : n_wide_enough + 1]
     goal = tuple(np.argwhere(within(least) & beyond)[0])
     way = planner.cheapest(np.where(distance >= least, 1.0, np.inf), (row, column), goal)
-    if way is None:
-        return None
+    assert way is not None, "both ends are in one piece"
     # Where the way last leaves what a wider robot gets to: it may pass obstacles as closely before, without need.
     narrow = way[min(np.flatnonzero(within(wider)[tuple(way.T)]).max(initial=0) + 1, len(way) - 1)]
-    around = np.argwhere(planner.blocked(grid, allow_unknown))
-    nearest = around[np.argmin(np.sum((around - narrow) ** 2, axis=1))] if len(around) else narrow
+    unseen = np.argwhere(np.pad(grid.state == -1, 1, constant_values=True)) - 1  # what lies outside the grid was not seen either
+    side = float(distance[tuple(narrow)]) / float(grid.resolution) + JAMB
+    is_unseen = not allow_unknown and bool((np.linalg.norm(unseen - narrow, axis=1) <= side).any())
     xy = (narrow[::-1] + 0.5) * float(grid.resolution) + grid.origin
-    return Gap((float(xy[0]), float(xy[1])), 2.0 * float(distance[tuple(narrow)]), bool(grid.state[tuple(nearest)] == -1))
+    return Gap((float(xy[0]), float(xy[1])), 2.0 * float(distance[tuple(narrow)]), is_unseen)

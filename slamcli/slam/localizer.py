@@ -59,7 +59,9 @@ class Localizer:
         self.previous = PreviousFrame(sparse_map, recording.matches)
         self.aligner = DepthAligner(sparse_map, known.points, recording.points)
         self._local_map = LocalMap(sparse_map, settings)
-        self._by_depth = DepthLocalizer(sparse_map, self.poses, self.aligner, self._local_map, settings, make_reference=make_reference)
+        self._depth_localizer = DepthLocalizer(
+            sparse_map, self.poses, self.aligner, self._local_map, settings, make_reference=make_reference
+        )
         self._relocalizer = Relocalizer(sparse_map, known.places, recording.words, settings, rng)
 
     def process(self, i: int) -> None:
@@ -85,9 +87,9 @@ class Localizer:
         if found is not None and self.poses.has_background:
             found = self._reconcile(i, found)
         if found is None or found.estimate.n_inliers < self._settings.depth_icp_below:
-            by_depth = self._by_depth.locate(i, frame, found)
-            if by_depth is not None:
-                return _by_depth(by_depth)
+            aligned = self._depth_localizer.locate(i, frame, found)
+            if aligned is not None:
+                return _by_depth(aligned)
         if found is not None:
             return self._by_landmarks(found, TRACKED)
         found = self._relocalize(i, frame)

@@ -158,3 +158,17 @@ def test_resizing_invents_no_depth_at_a_jump_and_spreads_no_hole() -> None:
     found = resized(depth, 64, 48)
     assert set(np.unique(found[np.isfinite(found)])) == {1.0, 2.0}
     assert np.isnan(found).sum() == 16  # the pixel itself, four times as large each way
+
+
+@pytest.mark.parametrize("turn", [np.radians(70.0), np.pi / 2])
+def test_cameras_that_hardly_face_the_same_way_get_readings_as_they_are(turn: float) -> None:
+    """No slope is followed there: it would be of another direction, or without bound."""
+    wide = replace(DEPTH, fx=45.0, fy=45.0)
+    given = Registration(wide, replace(COLOUR, fx=45.0, fy=45.0), pose((0.0, turn, 0.0), (0.0, 0.0, 0.0)))
+    depth = np.fromfunction(lambda i, j: 2.0 + 0.01 * j + 0.005 * i, (120, 160)).astype(np.float32)
+    ray = np.concatenate([wide.rays.astype(float), np.ones((120, 160, 1))], axis=2) @ given.T_cd[:3, :3].T
+    found = given.apply(depth)
+    found = found[np.isfinite(found)]
+    assert len(found) > 500
+    apart = np.abs(np.sort((depth * ray[..., 2]).ravel())[:, None] - found[::7]).min(axis=0)
+    assert apart.max() < 1e-5

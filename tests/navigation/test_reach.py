@@ -60,6 +60,14 @@ def test_what_bounds_a_gap_is_told_from_what_was_never_seen() -> None:
     assert not gap_of(two_rooms((30, 36), wall=1)).is_unseen
 
 
+def test_beyond_the_rim_of_the_grid_nothing_was_seen() -> None:
+    """A passage of 0.3 m between an obstacle and the rim, of which only the obstacle is known to end it."""
+    state = np.zeros((100, 80), np.int8)
+    state[50, 6:] = 1
+    gap = gap_of(Grid(np.abs(state).astype(np.float32), np.ones((100, 80), np.int32), state, np.zeros(2), np.array(RESOLUTION)))
+    assert gap.is_unseen and gap.xy[0] < 0.2 and gap.width < 0.3
+
+
 def test_behind_a_closed_wall_there_is_no_way_of_any_width() -> None:
     assert gap_of(two_rooms()) is None
 
