@@ -42,8 +42,9 @@ def local(workers: int, memory: int, *, progress: Progress = silent, tell: Tell 
     from distributed import Client, LocalCluster
 
     compilation.ensure(progress=progress, tell=tell)  # once, and not by every worker at the same time
-    options = {"n_workers": workers, "threads_per_worker": 1, "memory_limit": memory, "dashboard_address": None}
-    options |= {"silence_logs": logging.CRITICAL}
+    options: dict[str, Any] = {"n_workers": workers, "threads_per_worker": 1, "memory_limit": memory, "silence_logs": logging.CRITICAL}
+    # No dashboard; the scheduler's HTTP server starts all the same, and warns where another program has the usual port.
+    options |= {"dashboard_address": None, "scheduler_kwargs": {"dashboard_address": "127.0.0.1:0"}}
     with ExitStack() as stack:
         folder = stack.enter_context(files.scratch("slamcli-batch-"))
         # The scheduler takes no folder else; and nobody looks at what each worker's profiler writes down a hundred times a second.

@@ -4,11 +4,13 @@ import json
 import os
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -390,3 +392,13 @@ def test_a_cluster_of_this_machine_leaves_nothing_in_the_temporary_folder(tmp_pa
         profiled = client.run(lambda: __import__("dask").config.get("distributed.worker.profile.enabled"))
         assert list(profiled.values()) == [False]
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_cluster_of_this_machine_needs_no_port_that_another_program_has(recwarn: pytest.WarningsRecorder) -> None:
+    with socket.socket() as other:
+        with suppress(OSError):  # taken already
+            other.bind(("127.0.0.1", 8787))
+            other.listen()
+        with cluster.local(1, 1 << 30) as client:
+            assert client.submit(sum, (1, 2)).result(timeout=60) == 3
+    assert not [str(warning.message) for warning in recwarn if issubclass(warning.category, UserWarning)]
