@@ -27,7 +27,7 @@ def check(value: Any) -> None:
     for spec in fields(value):
         column = np.asarray(getattr(value, spec.name))
         name, dtype, shape = f"{type(value).__name__}.{spec.name}", spec.metadata["dtype"], spec.metadata["shape"]
-        if column.dtype not in (dtype, *spec.metadata["narrow"]):
+        if column.dtype not in (dtype, *(() if spec.metadata["widen"] else spec.metadata["narrow"])):
             raise ValueError(f"{name}: dtype {column.dtype} is not {dtype}")
         if len(column.shape) != len(shape) or not all(_fits(n, symbol, bound) for n, symbol in zip(column.shape, shape, strict=True)):
             raise ValueError(f"{name}: shape {column.shape} does not fit {list(shape)} with {bound}")
@@ -171,10 +171,10 @@ def load(cls: type[Record], folder: Path) -> Record:
     """Read a record that `save` wrote; SlamError when a file is absent, torn, or not what `cls` declares.
 
     Arrays are mapped, not read. The map is private and writable: kernels then see the same array type as for fresh arrays and are
-    compiled once, while a write never reaches the file.
+    compiled once, while a write never reaches the file. Fields that are to be widened are read, where they were saved narrowly.
     """
     try:
-        value = cls(**{spec.name: _read(Path(folder) / f"{spec.name}.npy") for spec in fields(cls)})  # type: ignore[arg-type]  # mypy has no name for what is a dataclass
+        value = cls(**{spec.name: _load_field(spec, Path(folder)) for spec in fields(cls)})  # type: ignore[arg-type]  # mypy has no name for what is a dataclass
         check(value)
     except ValueError as error:
         raise SlamError(f"{folder}: not what this version of slamcli writes ({error}); make it anew with: {hint().force()}") from error
@@ -186,6 +186,13 @@ def adopted(record: Record) -> Record:
     for spec in fields(record):  # type: ignore[arg-type]  # mypy has no name for what is a dataclass
         mapped_memory.adopt(getattr(record, spec.name))
     return record
+
+
+def _load_field(spec: Field, folder: Path) -> np.ndarray:
+    column = _read(folder / f"{spec.name}.npy")
+    if spec.metadata["widen"] and column.dtype in spec.metadata["narrow"]:
+        return column.astype(spec.metadata["dtype"])
+    return column
 
 
 def _read(path: Path) -> np.ndarray:

@@ -10,17 +10,19 @@ from typing import Any
 
 import numpy as np
 
-FORMAT = 8  # of everything a run directory holds; raised whenever an array changes its meaning
+FORMAT = 9  # of everything a run directory holds; raised whenever an array changes its meaning
 
 
-def array(dtype: str, shape: str, meaning: str, *, may_lack: bool = False, narrow: str = "") -> Any:
+def array(dtype: str, shape: str, meaning: str, *, may_lack: bool = False, narrow: str = "", widen: bool = False) -> Any:
     """Declare a field: numpy dtype, symbolic shape such as "M 2" or "F+1" ("" for a scalar), meaning with unit.
 
     may_lack : where the field is not given, it has no rows
     narrow : whole-number dtypes such as "u1 u2", the narrowest first: it is saved, and loaded, as the first of them that holds all values
+    widen : it is loaded in the dtype declared, into memory: for arrays that a stage reads whole
     """
     symbols = tuple(shape.split())
-    metadata = {"dtype": np.dtype(dtype), "narrow": tuple(np.dtype(one) for one in narrow.split()), "shape": symbols, "meaning": meaning}
+    narrower = tuple(np.dtype(one) for one in narrow.split())
+    metadata = {"dtype": np.dtype(dtype), "narrow": narrower, "widen": widen, "shape": symbols, "meaning": meaning}
     if may_lack:
         return field(default_factory=lambda: np.zeros([int(s) if s.isdigit() else 0 for s in symbols], dtype), metadata=metadata)
     return field(metadata=metadata)
@@ -70,14 +72,23 @@ class Flow:
 
 @dataclass(frozen=True)
 class Words:
-    """The visual words of every feature, by match. With the words' weights they make a frame's bag-of-words vector."""
+    """The visual words of every feature, by match. With the words' weights they make a frame's bag-of-words vector.
+
+    Features that have a node near the root of the vocabulary in common are compared: that above their word, or a second that is hardly farther.
+    """
 
     idf: np.ndarray = array("f4", "W", "inverse document frequency of each word of the vocabulary")
     word_offset: np.ndarray = array("i8", "F+1", "feature rows of a frame")
     word: np.ndarray = array("i4", "M", "word of each feature row", narrow="u2")
-    node: np.ndarray = array(
-        "i4", "M 2", "vocabulary nodes near the root: features under one node are compared; the second may be -1, none", narrow="i1 i2"
-    )
+    word_node: np.ndarray = array("i4", "W", "node near the root above each word", narrow="u1 u2")
+    second_node: np.ndarray = array("i4", "M", "second node near the root of each feature row, -1 = none", narrow="i1 i2")
+
+    def node(self, rows: slice | np.ndarray) -> np.ndarray:
+        """Return the first and the second node (N, 2) int32 of feature rows, -1 = no second."""
+        second = self.second_node[rows]
+        both = np.empty((len(second), 2), dtype=np.int32)
+        both[:, 0], both[:, 1] = self.word_node.take(self.word[rows]), second
+        return both
 
 
 @dataclass(frozen=True)
@@ -114,9 +125,9 @@ class Map:
     kf_segment: np.ndarray = array("i4", "K", "segment a key frame belongs to")
     T_wk: np.ndarray = array("f8", "K 4 4", "key frame's camera to its segment's world, the camera of its first frame with a pose")
     lm_xyz: np.ndarray = array("f8", "L 3", "m, world")
-    obs_lm: np.ndarray = array("i4", "O", "sorted by (landmark, key frame), pairs unique")
-    obs_kf: np.ndarray = array("i4", "O", "row in kf_frame")
-    obs_row: np.ndarray = array("i8", "O", "row in Features")
+    obs_lm: np.ndarray = array("i4", "O", "sorted by (landmark, key frame), pairs unique", narrow="u2", widen=True)
+    obs_kf: np.ndarray = array("i4", "O", "row in kf_frame", narrow="u1 u2", widen=True)
+    obs_row: np.ndarray = array("i8", "O", "row in Features", narrow="u4", widen=True)
     edge_kf: np.ndarray = array("i4", "E 2", "key frames (i, j), j < i, whose depth images were aligned", may_lack=True)
     edge_T_ij: np.ndarray = array("f8", "E 4 4", "x_i = T_ij @ x_j, as aligned", may_lack=True)
     edge_information: np.ndarray = array("f8", "E 6 6", "1/m^2, 1/rad^2, of the left twist of T_ij", may_lack=True)

@@ -45,4 +45,5 @@ def words_in(frames: list[list[int]]) -> Words:
     """Return words, all of equal weight, that the frames hold: with ten each, every one that two share makes them a tenth alike."""
     offset = np.cumsum([0, *map(len, frames)])
     word = np.concatenate([np.array(f, np.int32) for f in frames])
-    return Words(np.ones(word.max() + 1, np.float32), offset.astype(np.int64), word, word.astype(np.int32))
+    n = word.max() + 1
+    return Words(np.ones(n, np.float32), offset.astype(np.int64), word, np.arange(n, dtype=np.int32), np.full(len(word), -1, np.int32))

@@ -131,7 +131,8 @@ def words_of(landmark: np.ndarray, offset: np.ndarray, n_words: int) -> Words:
         idf=np.ones(n_words, np.float32),
         word_offset=np.array(offset, np.int64),
         word=landmark.astype(np.int32),
-        node=(landmark // 4).astype(np.int32),
+        word_node=np.arange(n_words, dtype=np.int32) // 4,
+        second_node=np.full(len(landmark), -1, np.int32),
     )
 
 

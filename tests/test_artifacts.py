@@ -162,6 +162,33 @@ def test_whole_numbers_are_saved_in_the_first_type_that_holds_them_all(tmp_path:
         artifacts.check(Narrowed(np.array(values, np.int64)))
 
 
+@dataclass(frozen=True)
+class Widened:
+    """A type that is narrow on disk alone."""
+
+    row: np.ndarray = array("i8", "M", "index", narrow="u1 u4", widen=True)
+
+
+@pytest.mark.parametrize(
+    ("values", "dtype"), [([], "u1"), ([255], "u1"), ([256], "u4"), ([2**32 - 1], "u4"), ([2**32], "i8"), ([-1], "i8"), ([-1, 2**62], "i8")]
+)
+def test_what_is_widened_is_narrow_on_disk_alone(tmp_path: Path, values: list[int], dtype: str) -> None:
+    artifacts.save(Widened(np.array(values, np.int64)), tmp_path)
+    assert np.load(tmp_path / "row.npy").dtype == dtype
+    row = artifacts.load(Widened, tmp_path).row
+    assert row.dtype == np.int64 and row.tolist() == values
+    row[:] = 7
+    assert artifacts.load(Widened, tmp_path).row.tolist() == values
+    with pytest.raises(ValueError, match=r"Widened.row: dtype uint8 is not int64"):
+        artifacts.check(Widened(np.array(values).astype(np.uint8)))
+
+
+def test_of_what_is_widened_another_type_is_refused(tmp_path: Path) -> None:
+    np.save(tmp_path / "row.npy", np.zeros(3, np.int32))
+    with pytest.raises(SlamError, match=r"Widened.row: dtype int32 is not int64"):
+        artifacts.load(Widened, tmp_path)
+
+
 def test_every_core_type_declares_dtype_shape_and_meaning_of_each_field() -> None:
     types = [value for value in vars(schema).values() if dataclasses.is_dataclass(value)]
     assert len(types) >= 8

@@ -188,8 +188,8 @@ class StepFinder:
         """Match the features of two frames; returns rows of the table of all features."""
         first_r, first_i = (int(self._features.offset[frame]) for frame in (reference, i))
         in_r, in_i = (slice(int(self._features.offset[frame]), int(self._features.offset[frame + 1])) for frame in (reference, i))
-        features, node = self._features, self._words.node
-        here, there = (hamming.Described(features.desc[rows], features.angle[rows], node[rows]) for rows in (in_i, in_r))
+        features, words = self._features, self._words
+        here, there = (hamming.Described(features.desc[rows], features.angle[rows], words.node(rows)) for rows in (in_i, in_r))
         row, _ = hamming.match_nodes(here, there, max_distance=MAX_DISTANCE, ratio=RATIO)
         return first_r + row[:, 1].astype(np.int64), first_i + row[:, 0].astype(np.int64)
 

@@ -60,7 +60,7 @@ def _points(frame: FrameFeatures, rows: np.ndarray) -> SeenPoints:
 
 
 def _described(frame: FrameFeatures, words: Words) -> hamming.Described:
-    node = words.node[frame.first_row : frame.first_row + len(frame)]
+    node = words.node(slice(frame.first_row, frame.first_row + len(frame)))
     return hamming.Described(frame.desc.view(np.uint8), frame.angle, node)
 
 

@@ -46,8 +46,8 @@ class Relocalizer:
         here = slice(frame.first_row, frame.first_row + len(frame))
         features = self._sparse_map.features
         match, _ = hamming.match_nodes(
-            hamming.Described(frame.desc.view(np.uint8), frame.angle, self._words.node[here]),
-            hamming.Described(features.desc[there], features.angle[there], self._places.words.node[there]),
+            hamming.Described(frame.desc.view(np.uint8), frame.angle, self._words.node(here)),
+            hamming.Described(features.desc[there], features.angle[there], self._places.words.node(there)),
         )
         ids = self._sparse_map.lm_of_row[there][match[:, 1]]
         return match[ids >= 0, 0], ids[ids >= 0]

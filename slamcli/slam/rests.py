@@ -99,8 +99,8 @@ class _Looks:
         """
         in_i, in_j = (slice(int(self.features.offset[frame]), int(self.features.offset[frame + 1])) for frame in (i, j))
         if row is None:
-            f, node = self.features, self.words.node
-            here, there = (hamming.Described(f.desc[rows], f.angle[rows], node[rows]) for rows in (in_i, in_j))
+            f, words = self.features, self.words
+            here, there = (hamming.Described(f.desc[rows], f.angle[rows], words.node(rows)) for rows in (in_i, in_j))
             row, _ = hamming.match_nodes(here, there, max_distance=MAX_DISTANCE, ratio=RATIO)
         xy_i, xy_j = self.features.xy[in_i][row[:, 0]], self.features.xy[in_j][row[:, 1]]
         in_sight = (xy_i[:, 0] > -self.camera.width) & (xy_j[:, 0] > -self.camera.width)

@@ -120,10 +120,14 @@ def join_match(parts: Sequence[RecordingPart], inputs: Inputs, out: Path, cfg: C
     first = inputs.load(Recordings, "extract").recording_offset
     words = [part.load(Words, "match") for part in parts]
     matches = [part.load(Matches, "match") for part in parts]
-    with artifacts.Writer(Words, out, "word", "node") as word_writer:
-        for word, node in ((one.word[rows], one.node[rows]) for one in words for rows in mapped_memory.blocks(one.node)):
-            word_writer.append(word=word.astype(np.int32), node=node.astype(np.int32))
-        joined = word_writer.finish(idf=np.array(words[0].idf), word_offset=_offsets([one.word_offset for one in words]))
+    with artifacts.Writer(Words, out, "word", "second_node") as word_writer:
+        for word, second in ((one.word[rows], one.second_node[rows]) for one in words for rows in mapped_memory.blocks(one.word)):
+            word_writer.append(word=word.astype(np.int32), second_node=second.astype(np.int32))
+        joined = word_writer.finish(
+            idf=np.array(words[0].idf),
+            word_node=words[0].word_node.astype(np.int32),
+            word_offset=_offsets([one.word_offset for one in words]),
+        )
     with artifacts.Writer(Matches, out, "row") as match_writer:
         for row in (one.row[rows] for one in matches for rows in mapped_memory.blocks(one.row)):
             match_writer.append(row=row.astype(np.int32))

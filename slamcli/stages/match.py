@@ -38,11 +38,12 @@ def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
 
 def _words(features: Features, words: vocabulary.Vocabulary, settings: MatchConfig, out: Path) -> Words:
     """Quantize all features and write their words."""
-    with artifacts.Writer(Words, out, "word", "node") as writer:
+    with artifacts.Writer(Words, out, "word", "second_node") as writer:
         for rows in mapped_memory.blocks(features.desc):
             word, node = vocabulary.quantize(words, features.desc[rows], node_level=settings.node_level, margin=settings.node_margin)
-            writer.append(word=word, node=node)
-        return writer.finish(idf=words.idf, word_offset=np.array(features.offset))
+            writer.append(word=word, second_node=node[:, 1])
+        word_node = words.node_of_word(settings.node_level)
+        return writer.finish(idf=words.idf, word_node=word_node, word_offset=np.array(features.offset))
 
 
 def seen(words: Words) -> np.ndarray:
@@ -67,6 +68,6 @@ def _match(features: Features, words: Words, flowed: np.ndarray, settings: Match
 def _match_descriptors(features: Features, words: Words, settings: MatchConfig, pair: tuple[int, int]) -> np.ndarray:
     i, j = (slice(int(features.offset[frame]), int(features.offset[frame + 1])) for frame in pair)
     checks: Any = {"max_distance": settings.max_distance, "ratio": settings.ratio, "check_rotation": settings.check_rotation}
-    here, there = (hamming.Described(features.desc[rows], features.angle[rows], words.node[rows]) for rows in (i, j))
+    here, there = (hamming.Described(features.desc[rows], features.angle[rows], words.node(rows)) for rows in (i, j))
     matched, _ = (hamming.match_brute if settings.method == "brute" else hamming.match_nodes)(here, there, **checks)
     return matched

@@ -47,6 +47,13 @@ class Vocabulary:
             level[start:stop] = level[start - 1] + 1 if start < stop else 0
         return level
 
+    def node_of_word(self, level: int) -> np.ndarray:
+        """Return the node `level` levels below the root above each word, or the word's own where that comes sooner, (W,) int32."""
+        node, parent = np.flatnonzero(np.diff(self.first_child) == 0).astype(np.int32), np.append(np.int32(0), self.parent)
+        while (is_deeper := self.level[node] > level).any():
+            node[is_deeper] = parent[node[is_deeper]]
+        return node
+
     @property
     def parent(self) -> np.ndarray:
         """Return the parent of each node but the root, (V - 1,) int32."""

@@ -112,9 +112,9 @@ def n_verified(scene: Scene, **options) -> int:
     """Of eight tries to verify a true candidate, most of whose matches are wrong, count those that succeed."""
     rows, rng = np.arange(*scene.features.offset[41:43]), np.random.default_rng(0)
     mixed = rng.permutation(rows[90:])
-    desc, node = scene.features.desc.copy(), scene.words.node.copy()
-    desc[rows[90:]], node[rows[90:]] = desc[mixed], node[mixed]
-    spoilt = replace(scene, features=replace(scene.features, desc=desc), words=replace(scene.words, node=node))
+    desc, word = scene.features.desc.copy(), scene.words.word.copy()
+    desc[rows[90:]], word[rows[90:]] = desc[mixed], word[mixed]
+    spoilt = replace(scene, features=replace(scene.features, desc=desc), words=replace(scene.words, word=word))
     return sum(verified(spoilt, seed=seed, min_inliers=30, **options).is_accepted for seed in range(8))
 
 

@@ -48,7 +48,7 @@ def blind(n: int) -> tuple[Features, Words, Matches]:
         stamp=stamp, depth_stamp=stamp.copy(), offset=np.zeros(n + 1, np.int64), xy=np.zeros((0, 2), np.float32),
         depth=none.astype("f4"), slope=np.zeros((0, 2), "f4"), octave=none.astype("u1"), angle=none.astype("f4"), desc=np.zeros((0, 32), np.uint8), octave_scale=np.array(1.2),
     )  # fmt: skip
-    words = Words(np.ones(5, "f4"), np.zeros(n + 1, np.int64), none.astype("i4"), np.zeros((0, 2), "i4"))
+    words = Words(np.ones(5, "f4"), np.zeros(n + 1, np.int64), none.astype("i4"), np.zeros(5, "i4"), none.astype("i4"))
     pair = np.stack([np.arange(1, n), np.arange(n - 1)], axis=1).astype(np.int32)
     return features, words, Matches(pair, np.zeros(n, np.int64), np.zeros((0, 2), np.int32))
 

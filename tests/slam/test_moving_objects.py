@@ -160,7 +160,9 @@ def without_texture(views: Views) -> tuple[Features, Words]:
         stamp=views.stamp, depth_stamp=views.stamp, offset=np.zeros(FRAMES + 1, np.int64), octave_scale=np.float64(1.2),
         **{name: np.zeros(size, kinds.get(name, np.float32)) for name, size in empty.items()},
     )  # fmt: skip
-    return features, Words(np.ones(1, np.float32), np.zeros(FRAMES + 1, np.int64), np.zeros(0, np.int32), np.zeros((0, 2), np.int32))
+    return features, Words(
+        np.ones(1, np.float32), np.zeros(FRAMES + 1, np.int64), np.zeros(0, np.int32), np.zeros(1, np.int32), np.zeros(0, np.int32)
+    )
 
 
 def test_the_motion_of_the_room_is_found_where_somebody_walks_along() -> None:

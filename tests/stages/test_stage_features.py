@@ -14,11 +14,12 @@ from slamcli.config.options import Config, ExtractConfig, MatchConfig
 from slamcli.datasets import open_dataset
 from slamcli.depth import at_key_points
 from slamcli.errors import SlamError
+from slamcli.formats import vocabulary_file
 from slamcli.geometry.camera import Camera
 from slamcli.schema import Features, Flow, Matches, Words
 from slamcli.slam.place_recognition import bow_vector
 from slamcli.stages import extract, match
-from slamcli.vision import hamming, orb
+from slamcli.vision import hamming, orb, vocabulary
 
 
 class Tools:
@@ -168,7 +169,13 @@ def test_words_and_matches_keep_their_promises(features: Features, tmp_path: Pat
     assert summary["pairs"] == len(matches.pair) == 3 * n_frames - 6
     assert (matches.pair[:, 1] < matches.pair[:, 0]).all() and (matches.pair[:, 0] - matches.pair[:, 1] <= 3).all()
     assert [tuple(p) for p in matches.pair] == sorted(tuple(p) for p in matches.pair)
-    assert words.word.dtype == matches.row.dtype == np.uint16 and words.node.dtype == np.int8  # as narrow as the values allow
+    assert words.word.dtype == matches.row.dtype == np.uint16 and words.second_node.dtype == np.int8  # as narrow as the values allow
+    _, node = vocabulary.quantize(
+        vocabulary_file.read(""), features.desc, node_level=MatchConfig().node_level, margin=MatchConfig().node_margin
+    )
+    np.testing.assert_array_equal(words.node(slice(0, None)), node)
+    some = np.array([5, 1, 5])
+    np.testing.assert_array_equal(words.node(some), node[some])
     for p, (i, j) in enumerate(matches.pair[:9]):
         rows = matches.row[matches.offset[p] : matches.offset[p + 1]]
         assert len(np.unique(rows[:, 0])) == len(np.unique(rows[:, 1])) == len(rows)

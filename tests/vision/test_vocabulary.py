@@ -131,6 +131,7 @@ def test_the_node_is_the_words_ancestor(small: Vocabulary, node_level: int) -> N
     word, node = vocabulary.quantize(small, desc, node_level=node_level)
     leaf = np.flatnonzero(small.word_of_node >= 0)[word]
     assert (node[:, 1] == -1).all()
+    np.testing.assert_array_equal(small.node_of_word(node_level)[word], node[:, 0])
     for v, ancestor in zip(leaf, node[:, 0], strict=True):
         while v != ancestor:
             assert small.level[v] > node_level
