@@ -26,7 +26,7 @@ CHANGING = (  # hold times, or nothing that is read again
 COMMANDS: tuple[Command, ...] = (
     ("run", "-r", "run", "--from", "match"),
     ("run", "-r", "run", "--from", "densify"),
-    ("run", "ONE", "TWO", "-r", "house", "--from", "track"),
+    ("run", "ONE", "TWO", "-r", "./house", "--from", "track"),
     ("add", "grown", "TWO"),
     ("batch", "ONE", "--out", "week", "--workers", "1"),
     ("export-trajectory", "out/t.txt", "-r", "run"),
@@ -89,7 +89,7 @@ class Stand:
         for name in ("out", "tmp"):
             Path(name).mkdir()
         _few_words(Path("words.npz"))
-        self._must("run", "ONE", "-r", "run")
+        self._must("run", "ONE", "-r", "./run")
         shutil.copytree("run", "grown")
         shutil.copytree("run", "grown.before")
         self.commands = []

@@ -23,6 +23,7 @@ from slamcli.config.toml import Settings
 from slamcli.console import Progress, Tell, silent
 from slamcli.errors import SlamError
 from slamcli.hints import hint
+from slamcli.runs import places
 from slamcli.runs.creation import create_run, open_target, writing
 from slamcli.runs.run_directory import RunDir
 from slamcli.runs.several import extend, pipeline
@@ -70,7 +71,7 @@ def run(
     target : a recording's folder, a name such as ``tum/fr1_room``, or ``demo``; of several, which then have one map, `path` must be given
     settings : options by full name, ``{"track.min_inliers": 20}``, laid over the run's own (the defaults for a new run)
     config : fast, accurate, default or a TOML file, to start from instead of the run's own
-    path : the run directory; None: ``runs/<recording>``
+    path : the run directory, or a name for it under ``runs/``; None: ``runs/<recording>``
     data : folder of recordings to look in first
     start, until, force : run from this stage on whether up to date or not; stop after this one; run every stage
     progress : passes items through under a bar, as ``progress(items, label, total=None)``; tell : takes single lines
@@ -81,8 +82,9 @@ def run(
     """
     settings = settings if isinstance(settings, Mapping) else tuple(settings)
     resolve = partial(toml.resolve, name_or_file=config, settings=settings)
+    place = None if path is None else places.named(os.fspath(path))
     targets = [str(target)] if isinstance(target, (str, os.PathLike)) else [str(one) for one in target]
-    reopen = partial(create_run, targets, path=path, data=data, progress=progress)
+    reopen = partial(create_run, targets, path=place, data=data, progress=progress)
     opened, dataset, resolved = reopen(resolve=resolve)
     found: dict[str, Sequence[Finding]] = {}
     if look is not None and (force or start == NAMES[0] or not pipeline(opened, resolved, dataset=dataset).states()[NAMES[0]].is_fresh):
@@ -98,7 +100,7 @@ def run(
 
 
 def open_run(path: str | os.PathLike[str] | None = None, *, restore: bool = False) -> "Run":
-    """Open the run directory `path`; None: the one that $SLAMCLI_RUN names, else the last one made here.
+    """Open the run directory `path`, or the run of that name under ``runs/``; None: the one that $SLAMCLI_RUN names, else the last one made here.
 
     restore : where ``run.json`` or ``config.toml`` is damaged, write it anew from what the stages recorded
 

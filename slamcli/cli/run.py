@@ -25,7 +25,13 @@ STAGE = click.Choice(NAMES)
 
 @click.command("run")
 @click.argument("targets", nargs=-1, metavar="[TARGET]...", shell_complete=complete_target)
-@click.option("-r", "--run", metavar="DIR", help="Where the run goes; needed with several. [default: $SLAMCLI_RUN, else runs/<recording>]")
+@click.option(
+    "-r",
+    "--run",
+    metavar="DIR",
+    shell_complete=complete_run,
+    help="The run directory, or its name under runs/; needed with several. [default: $SLAMCLI_RUN, else runs/<recording>]",
+)
 @click.option("--data", metavar="DIR", help="Folder of recordings. [default: $SLAMCLI_DATA, else ./data]")
 @recording_options
 @config_option

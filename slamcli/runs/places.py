@@ -17,14 +17,33 @@ RECORDINGS = "recordings"  # folder of the runs of single recordings inside a ru
 
 def find(run: str | None) -> Path:
     """Return the run a command means: `run` (of -r), a folder or a name under runs/, else $SLAMCLI_RUN, else the one last touched."""
-    named = run or os.environ.get("SLAMCLI_RUN")
-    path = Path(named) if named else LATEST
-    if named and not is_run(path) and is_run(RUNS / named):
-        path = RUNS / named
-    if is_run(path):
-        return path if named else Path(os.path.relpath(path.resolve()))
-    if named:
+    name = run or os.environ.get("SLAMCLI_RUN")
+    path = named(name) if name else _latest()
+    if not is_run(path):
         raise SlamError(f"{path}: not a run directory (it has no run.json); make one with: {hint().make(path)}")
+    return path
+
+
+def named(run: str) -> Path:
+    """Return the run directory that `run` names, a folder or a name under runs/, whether it is there yet or not.
+
+    What is a run counts first, here before under runs/. Of the others a folder that is here does, and a path with a separator means what
+    it says; a bare name is one under runs/.
+    """
+    if is_run(Path(run)):
+        return Path(run)
+    if is_run(RUNS / run):
+        return RUNS / run
+    is_name = os.path.basename(run) == run and not Path(run).is_dir()
+    if not is_name:
+        return Path(run)
+    return _latest() if run == LATEST.name else default_path(run)
+
+
+def _latest() -> Path:
+    """Return the run that was touched last."""
+    if is_run(LATEST):
+        return Path(os.path.relpath(LATEST.resolve()))
     raise SlamError(
         f"no run here yet (runs/latest leads nowhere); make one with: {hint().demo()}, or name one with {hint().argument('path')}"
     )

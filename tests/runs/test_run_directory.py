@@ -78,6 +78,41 @@ def test_no_run_and_no_such_run_say_what_to_do(tmp_path: Path, monkeypatch: pyte
         RunDir.find("runs/x")
 
 
+def test_a_bare_name_is_one_under_runs_whether_it_is_there_or_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert places.named("fast") == Path("runs/fast")
+    create(places.named("fast"))
+    assert RunDir.find("fast").path == places.named("fast") == Path("runs/fast")
+    with pytest.raises(SlamError, match=r"^runs/slow: not a run directory .*path='runs/slow'\)$"):
+        RunDir.find("slow")
+
+
+@pytest.mark.parametrize("path", ["./fast", "sub/fast", "/sub/fast", "..", ".", "fast/"])
+def test_a_path_means_what_it_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, path: str) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert places.named(path) == Path(path)
+
+
+def test_what_is_here_counts_before_a_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("fast").mkdir()
+    assert places.named("fast") == Path("fast")  # a folder, if no run yet
+    create(Path("runs") / "fast")
+    assert places.named("fast") == RunDir.find("fast").path == Path("runs/fast")  # a run counts before a folder
+    create(Path("fast"))
+    assert places.named("fast") == RunDir.find("fast").path == Path("fast")
+    Path("slow").write_text("a file")
+    assert places.named("slow") == Path("runs/slow")
+
+
+def test_latest_is_no_name_for_a_new_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SlamError, match="no run here yet"):
+        places.named("latest")
+    create(Path("runs") / "near").mark_latest()
+    assert places.named("latest").resolve() == (tmp_path / "runs" / "near").resolve()
+
+
 @pytest.mark.parametrize("name", ["", "..", "../x", "/etc", "latest", "a/../../b"])
 def test_no_recording_name_leads_out_of_runs(name: str) -> None:
     with pytest.raises(SlamError, match="name one with path"):
