@@ -182,11 +182,7 @@ def one(
 
 def stage_lines(log: Path) -> int:
     """Count the ends of stages that a run's log tells of."""
-    return sum(
-        f"INFO slamcli.runs.pipeline: {name:<9}  " in line and " frames  " in line
-        for line in log.read_text().splitlines()
-        for name in NAMES
-    )
+    return sum(f" s  {name:<8}  DEBUG    done  " in line for line in log.read_text().splitlines() for name in NAMES)
 
 
 def digests(run: RunDir) -> dict[str, str]:

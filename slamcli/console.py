@@ -7,8 +7,10 @@ import contextlib
 import logging
 import os
 import sys
+import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from contextvars import ContextVar
 from io import TextIOWrapper
 from pathlib import Path
 from typing import Any, TypeVar
@@ -20,6 +22,7 @@ Progress = Callable[..., Iterable[Any]]  # (items, label, total=None) -> the sam
 Tell = Callable[[str], Any]  # takes a line
 ROOT = logging.getLogger("slamcli")
 AMBER, PLAIN = "\x1b[33m", "\x1b[0m"
+_stage: ContextVar[str] = ContextVar("_stage", default="")  # that is at work
 
 
 class _Voice:
@@ -36,8 +39,26 @@ class _StderrHandler(logging.Handler):
         _write(f"{record.levelname.capitalize()}: {record.getMessage()}" if record.levelno >= logging.WARNING else record.getMessage())
 
 
+class _LogLines(logging.Formatter):
+    """Give each line of a message the seconds since the log was begun, the stage that is at work, "-" for none, and the level."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._began = time.time()
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Lay a record out; a message that begins with its stage, as on the terminal, is not told it twice."""
+        stage = _stage.get()
+        head = f"{max(0.0, record.created - self._began):9.3f} s  {stage or '-':<8}  {record.levelname:<7}  "
+        return "\n".join(head + line for line in super().format(record).removeprefix(f"{stage}: ").splitlines())
+
+
 class _LogFile(logging.FileHandler):
     """The run's log. A disk that is full stops the run where it writes results, and says so there."""
+
+    def tell(self, message: str) -> None:
+        """Write a line that the terminal does not show."""
+        self.handle(ROOT.makeRecord(ROOT.name, logging.INFO, "", 0, message, (), None))
 
     def _open(self) -> TextIOWrapper:
         """Follow no link, and wait for no pipe."""
@@ -66,6 +87,11 @@ def _write(line: str) -> None:
             sys.stderr.write(line + "\n")
 
 
+def is_verbose() -> bool:
+    """Say whether more was asked for, by -v."""
+    return _Voice.verbosity > 0
+
+
 def set_up(verbosity: int, *, quiet: bool = False) -> None:
     """Send the log to stderr: warnings, from 1 information, from 2 everything; `quiet` leaves out progress and what was made."""
     _Voice.verbosity, _Voice.is_quiet = verbosity, quiet
@@ -78,13 +104,25 @@ def set_up(verbosity: int, *, quiet: bool = False) -> None:
 
 
 @contextmanager
-def log_file(path: Path) -> Iterator[None]:
-    """Append everything that is logged meanwhile to a file, and the traceback of what ends it early."""
-    handler = _LogFile(path, encoding="utf-8")
-    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
-    ROOT.addHandler(handler)
+def at_work(stage: str) -> Iterator[None]:
+    """Put the stage's name into the lines of the log meanwhile."""
+    token = _stage.set(stage)
     try:
         yield
+    finally:
+        _stage.reset(token)
+
+
+@contextmanager
+def log_file(path: Path, what: str) -> Iterator[None]:
+    """Append everything that is logged meanwhile to a file, after date and time and `what` is done, and the traceback of what ends it early."""
+    handler = _LogFile(path, encoding="utf-8")
+    handler.setFormatter(_LogLines())
+    ROOT.addHandler(handler)
+    handler.tell(f"{time.strftime('%Y-%m-%d %H:%M:%S %z')}: {what}")
+    try:
+        yield
+        handler.tell("ended")
     except BaseException:
         ROOT.debug("ended early", exc_info=True)
         raise
@@ -123,8 +161,8 @@ def table(rows: Sequence[Sequence[str]], *, right: Iterable[int] = ()) -> str:
     return "\n".join(lines)
 
 
-def stage_line(record: Mapping[str, Any], told: Sequence[str]) -> str:
-    """Tell one finished stage in a line: frames, time, rate, and those counts of its summary that are `told`; all of them under -v."""
+def stage_line(record: Mapping[str, Any], told: Sequence[str] | None) -> str:
+    """Tell one finished stage in a line: frames, time, rate, and those counts of its summary that are `told`; all of them for None, and under -v."""
     summary = record["summary"]
     parts = [f"{record['stage']:<9}"]
     if "frames" in summary:
@@ -134,10 +172,15 @@ def stage_line(record: Mapping[str, Any], told: Sequence[str]) -> str:
         parts.append(f"{record['fps']:.1f} fps")
     if record["compile_seconds"] >= 0.5:
         parts.append(f"({record['compile_seconds']:.1f} s of it compiling kernels, this once)")
-    parts += counts(summary, None if _Voice.verbosity else told)
+    parts += counts(summary, None if is_verbose() else told)
     if record["n_warnings"]:
-        parts.append(f"{record['n_warnings']} warnings")
+        parts.append(warning_count(record["n_warnings"]))
     return "  ".join(parts)
+
+
+def warning_count(n: int) -> str:
+    """Write a number of warnings."""
+    return f"{n} warning{'s' * (n != 1)}"
 
 
 def counts(summary: Mapping[str, Any], names: Sequence[str] | None = None) -> list[str]:

@@ -2,6 +2,7 @@
 
 import json
 import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     from slamcli.runs.placement import Placement
     from slamcli.runs.run_directory import RunDir
     from slamcli.runs.staleness import State
+    from slamcli.runs.summary import Warned
     from slamcli.slam import doubt
 
 STAGE = click.Choice(NAMES)
@@ -233,32 +235,51 @@ stage_commands = tuple(_stage_command(stage) for stage in STAGES)
 @json_option
 @click.option("--verify", is_flag=True, help="Read every file again and compare its digest.")
 def status_command(run: str | None, config_name: str | None, assignments: tuple[str, ...], as_json: bool, verify: bool) -> None:
-    """Show which stages are up to date, and why the others are not.
+    """Show which stages are up to date, why the others are not, and how much each warned of; with -v, of what.
 
     With -s or --config it shows what such a change would make stale, and changes nothing.
     """
+    from slamcli import console
     from slamcli.config import toml
     from slamcli.runs.run_directory import RunDir
     from slamcli.runs.several import pipeline
+    from slamcli.runs.summary import warned
 
     rundir = RunDir.find(run)
     judged = pipeline(rundir, toml.resolve(rundir.config(), config_name, assignments))
     states = judged.states(verify=verify)
+    said = {name: warned(rundir, name) for name in states}
     if as_json:
-        click.echo(json.dumps([_state_object(state) for state in states.values()], indent=1))
+        click.echo(json.dumps([_state_object(state, said[name]) for name, state in states.items()], indent=1))
     else:
-        click.echo(_state_table(rundir, states))
+        click.echo(_state_table(rundir, states, said))
+    if console.is_verbose() and not as_json:
+        for line in _warned_lines(said):
+            click.echo(line)
     for note in judged.notes(states):
         click.echo(f"note: {note}", err=as_json)
+    if not as_json and not console.is_verbose() and any(one.count for one in said.values()):
+        console.say(f"what was warned of: slamcli status -v {run_flag(rundir.path)}")
 
 
-def _state_object(state: "State") -> dict[str, Any]:
+def _state_object(state: "State", said: "Warned") -> dict[str, Any]:
     names = ("seconds", "fps", "cpu_seconds", "peak_rss_mb", "digest", "summary", "warnings")
-    return {"stage": state.stage, "state": state.state, "reason": state.reason, **{name: state.record.get(name) for name in names}}
+    about = {"stage": state.stage, "state": state.state, "reason": state.reason, **{name: state.record.get(name) for name in names}}
+    return about | {"warned": said.texts, "n_warned": said.count}
 
 
-def _state_table(rundir: "RunDir", states: "dict[str, State]") -> str:
-    from slamcli.console import table
+def _warned_lines(said: "Mapping[str, Warned]") -> list[str]:
+    """Tell what each stage warned of."""
+    lines = []
+    for stage, warned in said.items():
+        lines += [f"{stage}: {text}" for text in warned.texts]
+        if left := warned.count - len(warned.texts):
+            lines.append(f"{stage}: {left} more; they are in log.txt")
+    return lines
+
+
+def _state_table(rundir: "RunDir", states: "dict[str, State]", said: "Mapping[str, Warned]") -> str:
+    from slamcli.console import table, warning_count
     from slamcli.runs.staleness import MISSING
 
     rows = []
@@ -270,7 +291,10 @@ def _state_table(rundir: "RunDir", states: "dict[str, State]") -> str:
             told, reason = (
                 ("cleaned", "") if told == MISSING else ("kept", "what it was made from was cleaned away: slamcli run makes all anew")
             )
-        rows.append([state.stage, told, *times, reason])
+        n = said[state.stage].count
+        rows.append([state.stage, told, *times, warning_count(n) if n else "", reason])
+    if not any(row[4] for row in rows):
+        rows = [[*row[:4], row[5]] for row in rows]
     return f"{rundir.path}: {rundir.info()['dataset']} ({rundir.info()['root']})\n" + table(rows, right=(2, 3))
 
 

@@ -6,6 +6,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from slamcli import __version__
 from slamcli.config.options import Config
 from slamcli.console import Progress, log_file, silent
 from slamcli.errors import SlamError
@@ -82,6 +83,8 @@ def _create_of_several(place: Path, datasets: "Sequence[Dataset]") -> "tuple[Run
 @contextmanager
 def writing(directory: RunDir, config: Config, *, wait: bool = False) -> Iterator[None]:
     """Lock the run, log to its file, and make `config` its configuration; `wait` for another process that holds it."""
-    with directory.lock(wait=wait), log_file(directory.path / "log.txt"):
+    info = directory.info()
+    what = f"slamcli {__version__} makes {info['dataset']} of {info['root']}"
+    with directory.lock(wait=wait), log_file(directory.path / "log.txt", what):
         directory.write_config(config)
         yield

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from slamcli import __version__, address_space, files, interruption
 from slamcli.config.options import Config
-from slamcli.console import Progress, Tell, silent, stage_line
+from slamcli.console import Progress, Tell, at_work, silent, stage_line
 from slamcli.errors import SlamError
 from slamcli.hints import hint
 from slamcli.jit import compilation
@@ -204,7 +204,8 @@ class Pipeline:
             if state.is_fresh and index < first_forced:
                 self._tell(f"{stage.name:<9}  {state.state}")
                 continue
-            log.info("%s: %s", stage.name, state.reason or state.state if index < first_forced else "asked for")
+            with at_work(stage.name):
+                log.info("%s: begins: %s", stage.name, state.reason or state.state if index < first_forced else "asked for")
             self.run_stage(stage)
             del known[stage.name]
         if self.recording_note:
@@ -236,6 +237,10 @@ class Pipeline:
 
     def run_stage(self, stage: Stage, *, begun: Begun | None = None) -> None:
         """Run one stage, or end one that was begun elsewhere, and put its folder in place; if it fails, the result before stays."""
+        with at_work(stage.name):
+            self._run_stage(stage, begun)
+
+    def _run_stage(self, stage: Stage, begun: Begun | None) -> None:
         address_space.require()
         inputs = {name: self._present_input(name) for name in (*stage.needs, *staleness.named_files(stage, self.config))}
         tools = Tools(stage.name, self.config, self._progress)
@@ -262,7 +267,7 @@ class Pipeline:
                 meter.add(seconds=begun.seconds, cpu_seconds=begun.cpu_seconds, peak_rss_mb=begun.peak_rss_mb)
             record = self._record(stage, inputs, damage.outputs(out), meter, tools, summary)
             self.run.commit(stage.name, out, record)
-        log.debug("%s", record)
+        log.debug("%s: %s", stage.name, _done_line(record))
         self._tell(stage_line(record, stage.told))
         return_free_memory(meter.taken_mb)
 
@@ -312,6 +317,13 @@ class Pipeline:
             "warnings": tools.warnings,
             "n_warnings": tools.n_warnings,
         }
+
+
+def _done_line(record: Mapping[str, Any]) -> str:
+    """Tell in a line all that a finished stage counted, what it cost, and what it wrote; the rest is in its record."""
+    mb = sum(entry["bytes"] for entry in record["outputs"].values()) / 1e6
+    cost = f"CPU {record['cpu_seconds']:.1f} s  {record['peak_rss_mb']:.0f} MiB  {len(record['outputs'])} files of {mb:.1f} MB"
+    return f"done  {stage_line(record, None).removeprefix(record['stage']).strip()}  {cost}  {record['digest']}"
 
 
 def _plain(value: Any) -> Any:

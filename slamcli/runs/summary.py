@@ -1,5 +1,6 @@
 """What a finished run made, in a few lines, and what can be done with it."""
 
+from dataclasses import dataclass
 from typing import Any
 
 from slamcli.console import table
@@ -28,6 +29,28 @@ def outcome(run: RunDir) -> str:
         *([["warnings", str(n_warnings), "log.txt"]] if n_warnings else []),
     ]
     return f"{said}\n" * bool(said) + table(rows)
+
+
+@dataclass(frozen=True)
+class Warned:
+    """What a stage warned of."""
+
+    texts: list[str]  # each once: its warnings, and what puts its result in doubt
+    count: int  # of all, also those of which a record keeps no text
+
+
+def warned(run: RunDir, stage: str) -> Warned:
+    """Gather what a stage warned of; in a run of several recordings, what it warned of each alone too, after the recording's name."""
+    own = [(run, "")] + [(RunDir(run.recording_path(entry["name"])), f"{entry['name']}: ") for entry in run.recordings]
+    texts, unkept = [], 0
+    for one, name in own:
+        record = one.record(stage)
+        if record is None:
+            continue
+        doubts = [row["text"] for row in record["summary"].get(doubt.DOUBTS, [])]
+        texts += [f"{name}{text}" for text in dict.fromkeys([*record["warnings"], *doubts])]
+        unkept += record["n_warnings"] - len(record["warnings"])
+    return Warned(texts, len(texts) + unkept)
 
 
 def to_dict(run: RunDir) -> dict[str, Any]:

@@ -2,11 +2,13 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 
 import click
@@ -16,10 +18,11 @@ from click.shell_completion import ShellComplete
 from click.testing import Result
 
 import slamcli as package
-from slamcli import datasets, files
+from slamcli import console, datasets, files
 from slamcli.cli.main import cli
 from slamcli.config.options import Config
 from slamcli.errors import SlamError
+from slamcli.slam.doubt import Finding, to_summary
 from slamcli.stages import NAMES, STAGES, stage_named
 
 Slamcli = Callable[..., Result]
@@ -278,7 +281,7 @@ def test_status_tells_state_reason_and_time(fake: Path, slamcli: Slamcli) -> Non
     result = slamcli("status", "-s", "track.min_inliers=20")
     lines = {line.split()[0]: " ".join(line.split()) for line in result.stdout.splitlines()[1:]}
     assert lines["extract"].startswith("extract up to date 0.")
-    assert lines["extract"].endswith(" fps")
+    assert lines["extract"].endswith(" fps 1 warning") and lines["match"].endswith(" fps")
     assert lines["track"].endswith(f"config: track.min_inliers {MIN_INLIERS} -> 20")
     assert lines["optimize"].endswith(f"config: track.min_inliers {MIN_INLIERS} -> 20"), "hindsight reads it too"
     assert lines["loop"].endswith("loop/out.txt has 0 bytes, 64 recorded")
@@ -341,13 +344,58 @@ def test_everything_that_was_said_is_in_the_log(fake: Path, slamcli: Slamcli) ->
     slamcli("track", "-s", "track.min_inliers=20")
     slamcli("grid2d")
     text = (fake / "runs/desk/log.txt").read_text()
-    assert "WARNING slamcli.runs.pipeline: grid2d rests on loop" in text
+    lines = text.splitlines()
+    assert all(re.fullmatch(r" *\d+\.\d{3} s  [-a-z0-9]+ +(DEBUG|INFO|WARNING|ERROR) +\S.*", line) for line in lines)
+    told = [re.split("  +", line.strip(), maxsplit=3) for line in lines]
+    assert [stage for _, stage, level, message in told if message.startswith("done  ")] == [*NAMES, "track", "grid2d"]
+    assert ["-", "WARNING", next(message for *_, message in told if message.startswith("grid2d rests on loop"))] in [
+        row[1:] for row in told
+    ]
+    assert ["extract", "INFO", "begins: missing"] in [row[1:] for row in told]
+    starts = [row for row in told if "slamcli" in row[3] and "desk" in row[3] and row[0] == "0.000 s"]
+    assert len(starts) == 3 == sum(row[1:] == ["-", "INFO", "ended"] for row in told)
+    assert all(float(a[0][:-2]) <= float(b[0][:-2]) or b in starts for a, b in pairwise(told))
+
+
+def test_status_tells_what_was_warned_of_with_v(fake: Path, slamcli: Slamcli, monkeypatch: pytest.MonkeyPatch) -> None:
+    module = fakes.module(stage_named("loop"))
+    run = module.run
+
+    def warn(inputs, out, cfg, tools) -> dict:
+        for i in range(103):
+            tools.warn(f"frame {i} is lost")
+        texts = ("frame 7 is lost", "poses are doubtful")
+        return {**run(inputs, out, cfg, tools), **to_summary(Finding("sign", text) for text in texts)}
+
+    module.run = warn
+    monkeypatch.setitem(sys.modules, "slamcli.stages.loop", module)
+    slamcli("run", "recordings/desk")
+    short, long = slamcli("status"), slamcli("status", "-v")
+    assert "  104 warnings" in short.stdout and "poses are doubtful" not in short.stdout
+    assert short.stderr == "what was warned of: slamcli status -v -r runs/desk\n"
+    assert "extract: rgb.txt: 2 repeated stamps\n" in long.stdout and "warned of" not in long.stderr
+    assert [line for line in long.stdout.splitlines() if line.startswith("loop: ")] == [
+        *(f"loop: frame {i} is lost" for i in range(100)),
+        "loop: poses are doubtful",
+        "loop: 3 more; they are in log.txt",
+    ]
+    row = next(row for row in json.loads(slamcli("status", "--json").stdout) if row["stage"] == "loop")
+    assert row["n_warned"] == 104 and len(row["warned"]) == 101 and row["warned"][-1] == "poses are doubtful"
+    assert slamcli("status", "-r", "runs/desk", "--quiet").stderr == ""
+
+
+def test_each_line_of_a_traceback_is_a_line_of_the_log(tmp_path: Path) -> None:
+    with pytest.raises(ZeroDivisionError), console.log_file(tmp_path / "log.txt", "a test"), console.at_work("match"):
+        1 / 0  # noqa: B018
+    lines = (tmp_path / "log.txt").read_text().splitlines()
+    assert len(lines) > 4 and all(re.match(r" *\d+\.\d{3} s  - +(INFO|DEBUG)  ", line) for line in lines)
+    assert lines[-1].endswith("ZeroDivisionError: division by zero")
 
 
 def test_v_tells_more_on_either_side_of_the_command(fake: Path, slamcli: Slamcli) -> None:
     slamcli("run", "recordings/desk")
     for arguments in (["-v", "run", "--from", "grid2d"], ["run", "--from", "grid2d", "-v"]):
-        assert "grid2d: asked for" in slamcli(*arguments).stderr
+        assert "grid2d: begins: asked for" in slamcli(*arguments).stderr
     assert "asked for" not in slamcli("run", "--from", "grid2d").stderr
 
 

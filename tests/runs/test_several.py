@@ -18,7 +18,7 @@ from slamcli.errors import SlamError
 from slamcli.evaluation import run_trajectories, trajectory_error
 from slamcli.formats.trajectory import read_tum
 from slamcli.geometry import se3
-from slamcli.runs import several
+from slamcli.runs import several, summary
 from slamcli.runs.creation import create_run
 from slamcli.runs.pipeline import Pipeline
 from slamcli.runs.run_directory import RunDir
@@ -147,6 +147,15 @@ def test_what_reads_a_run_reads_one_of_several(house: RunDir, slamcli: Callable,
     assert {state["state"] for state in states} == {"up to date"}
     listed = json.loads(slamcli("list", house.path.parent, "--json").stdout)
     assert [one["recording"] for one in listed] == ["again + elsewhere + room"]
+
+
+def test_what_recordings_warned_of_alone_is_told_of_the_run(house: RunDir, monkeypatch: pytest.MonkeyPatch) -> None:
+    said = {"house": ["all is dark"], "elsewhere": ["frame 3 skipped", "frame 4 skipped"]}
+    records = lambda run, stage: {"warnings": said.get(run.path.name, []), "n_warnings": 9, "summary": {}} if stage == "extract" else None  # noqa: E731
+    monkeypatch.setattr(RunDir, "record", records)
+    told = summary.warned(house, "extract")
+    assert told.texts == ["all is dark", "elsewhere: frame 3 skipped", "elsewhere: frame 4 skipped"]
+    assert told.count == 36 and summary.warned(house, "grid2d") == summary.Warned([], 0)
 
 
 def test_frames_are_numbered_through(house: RunDir) -> None:
