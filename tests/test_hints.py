@@ -101,10 +101,10 @@ def test_one_message_speaks_python_to_a_caller_in_python_and_the_shell_to_a_comm
     monkeypatch.chdir(tmp_path)
     with pytest.raises(SlamError) as told:
         api.open_run("front room")
-    assert str(told.value).endswith("make one with: slamcli.run(TARGET, path='front room')")
+    assert str(told.value).endswith("make one with: slamcli.run(TARGET, path='runs/front room')")
     said = slamcli("status", "-r", "front room")
     assert said.exit_code == 1
-    assert said.output.rstrip().endswith("make one with: slamcli run TARGET -r 'front room'")
+    assert said.output.rstrip().endswith("make one with: slamcli run TARGET -r 'runs/front room'")
     assert type(hint()) is Hints, "a command leaves nothing behind in a process that goes on"
 
 
