@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-FORMAT = 9  # of everything a run directory holds; raised whenever an array changes its meaning
+FORMAT = 9  # of everything a run directory holds; raised whenever an array or a seal changes its meaning
 
 
 def array(dtype: str, shape: str, meaning: str, *, may_lack: bool = False, narrow: str = "", widen: bool = False) -> Any:

@@ -261,6 +261,25 @@ def test_a_sealed_record_comes_back_and_no_flipped_bit_passes(
         files.read_sealed(path)
 
 
+def test_a_seal_is_of_the_text_and_not_of_what_the_text_means(tmp_path: Path) -> None:
+    path = tmp_path / "run.json"
+    files.write_sealed(path, {"name": "caf\u00e9", "n": 1.0})
+    text = path.read_text()
+    assert "\\u00e9" in text
+    for other in (text.replace("00e9", "00E9"), text.replace("1.0", "1.00"), text.replace(": 1", ":  1"), text.replace("\n", "\r\n")):
+        assert json.loads(other) == json.loads(text)
+        path.write_bytes(other.encode())
+        with pytest.raises(SlamError, match="not as slamcli wrote it"):
+            files.read_sealed(path)
+
+
+@pytest.mark.parametrize("text", ['["', '{"a": ["', "", '{"a": {"b": "'])
+def test_a_seal_does_not_make_a_record_of_what_is_none(tmp_path: Path, text: str) -> None:
+    (tmp_path / "run.json").write_text(files._closed(text))
+    with pytest.raises(SlamError, match="run.json: not valid JSON"):
+        files.read_sealed(tmp_path / "run.json")
+
+
 def test_a_sealed_record_that_lost_its_end_or_its_seal_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "run.json"
     files.write_sealed(path, {"a": 1, "b": [2.5, None]})

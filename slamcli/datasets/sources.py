@@ -34,17 +34,20 @@ class ImageFiles:
 
     def __init__(self, root: Path, names: Sequence[str]) -> None:
         self.root, self.names = root, names
+        self._sizes: dict[int, int] = {}
 
     def where(self, i: int) -> str:
         """Return the path."""
         return str(self.root / self.names[i])
 
     def n_bytes(self, i: int) -> int:
-        """Ask the file system."""
-        try:
-            return os.stat(os.path.join(self.root, self.names[i])).st_size  # a hundred thousand are asked for: no Path of each
-        except (OSError, ValueError):  # ValueError: a NUL byte in the name
-            return -1
+        """Ask the file system, of each file once: that all are there, and what identifies the recording, is asked of a hundred thousand."""
+        if i not in self._sizes:
+            try:
+                self._sizes[i] = os.stat(os.path.join(self.root, self.names[i])).st_size  # no Path of each
+            except (OSError, ValueError):  # ValueError: a NUL byte in the name
+                self._sizes[i] = -1
+        return self._sizes[i]
 
     def read(self, i: int) -> bytes:
         """Read the whole file."""

@@ -8,15 +8,17 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+from slamcli import files
 from slamcli.config import toml
 from slamcli.config.options import Config
 from slamcli.errors import Damaged, SlamError
-from slamcli.files import read_bytes, sha256, write_bytes
 from slamcli.hints import hint
+from slamcli.schema import FORMAT
 
 Records = Mapping[str, Mapping[str, Any]]  # stage.json by stage
 
 SEAL = "# sealed "  # begins the last line of config.toml; the digest of all above it follows
+MOST_RECORDS = 64  # kept; a run has eight
 RECORD_KEYS: dict[str, Any] = {
     "stage": str,
     "config": dict,
@@ -36,6 +38,23 @@ RECORD_KEYS: dict[str, Any] = {
     "reader": str,
 }
 
+_records: dict[tuple[int, ...], dict[str, Any]] = {}  # by what changes when a file does: each is asked for dozens of times a run
+
+
+def read_record(path: Path) -> dict[str, Any]:
+    """Read a ``stage.json``; SlamError when it cannot be what this program wrote. One that nobody has written to since is not read again."""
+    version = files.version(path)
+    if version in _records:
+        return dict(_records[version])
+    record = files.read_sealed(path)
+    if "format" not in record or (record["format"] == FORMAT and not is_record(record)):
+        raise SlamError(f"{path}: not a stage's record")
+    if files.is_settled(version):
+        if len(_records) >= MOST_RECORDS:
+            _records.clear()
+        _records[version] = record
+    return dict(record)
+
 
 def is_record(record: Mapping[str, Any]) -> bool:
     """Say whether a ``stage.json`` has all that a stage's record has."""
@@ -49,9 +68,10 @@ def is_record(record: Mapping[str, Any]) -> bool:
 
 def outputs(folder: Path) -> dict[str, dict[str, Any]]:
     """List a stage's files with size and digest, by name."""
-    found = {path: path.stat() for path in sorted(folder.rglob("*")) if path.name != "stage.json"}
+    paths = sorted(os.path.join(home, name) for home, _, names in os.walk(folder) for name in names if name != "stage.json")
+    found = {path: os.stat(path) for path in paths}
     return {
-        path.relative_to(folder).as_posix(): {"bytes": status.st_size, "sha256": sha256(path, status)}
+        os.path.relpath(path, folder).replace(os.sep, "/"): {"bytes": status.st_size, "sha256": files.sha256(path, status)}
         for path, status in found.items()
         if stat.S_ISREG(status.st_mode)
     }
@@ -70,7 +90,7 @@ def find(folder: Path, outputs: Mapping[str, Any], names: Iterable[str], *, veri
             return f"{folder.name}/{name} is not there"
         if found.st_size != entry["bytes"]:
             return f"{folder.name}/{name} has {found.st_size} bytes, {entry['bytes']} recorded"
-        if verify and sha256(path, found) != entry["sha256"]:
+        if verify and files.sha256(path, found) != entry["sha256"]:
             return f"{folder.name}/{name} has other content than recorded"
     return ""
 
@@ -78,7 +98,7 @@ def find(folder: Path, outputs: Mapping[str, Any], names: Iterable[str], *, veri
 def write_config(path: Path, config: Config) -> None:
     """Write a configuration that `read_config` finds unchanged."""
     text = toml.dump(config).encode()
-    write_bytes(path, text + seal(text), through_links=False)
+    files.write_bytes(path, text + seal(text), through_links=False)
 
 
 def read_config(path: Path) -> Config:
@@ -86,7 +106,7 @@ def read_config(path: Path) -> Config:
 
     A file cut short may still be valid TOML, and would silently fall back to the defaults.
     """
-    return _sealed_config(read_bytes(path, limit=toml.LARGEST_FILE), str(path))
+    return _sealed_config(files.read_bytes(path, limit=toml.LARGEST_FILE), str(path))
 
 
 @functools.lru_cache(maxsize=8)  # every step of a command asks for it

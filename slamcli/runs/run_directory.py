@@ -320,16 +320,13 @@ class RunDir:
 
     def record(self, stage: str) -> dict[str, Any] | None:
         """Read a stage's ``stage.json``; None before it was run. Damaged when it cannot be what this program wrote."""
-        path = self.path / stage / "stage.json"
-        if not path.parent.is_dir():
+        folder = os.path.join(self.path, stage)
+        if not os.path.isdir(folder):
             return None
         try:
-            record = files.read_sealed(path)
+            return damage.read_record(Path(folder, "stage.json"))
         except SlamError as error:
             raise Damaged(f"{error}; repair it with: {hint().repair(self.path)}") from error
-        if "format" not in record or (record["format"] == FORMAT and not damage.is_record(record)):
-            raise Damaged(f"{path}: not a stage's record; repair it with: {hint().repair(self.path)}")
-        return record
 
     def damage(self, stage: str, *, verify: bool = False) -> str:
         """Say what is wrong with a stage's files, or "": each has its recorded size and, with `verify`, its recorded digest."""

@@ -71,7 +71,7 @@ def changes(recorded: Mapping[str, str], now: Mapping[str, str]) -> str:
     """Say which files differ between two states, such as "slam/tracker.py changed"; "" where none does."""
     if not recorded:
         return "its sources were not recorded"
-    changed = sorted(file for file in recorded.keys() | now.keys() if recorded.get(file) != now.get(file))
+    changed = [] if recorded == now else sorted(file for file in recorded.keys() | now.keys() if recorded.get(file) != now.get(file))
     if not changed:
         return ""
     more = f" and {len(changed) - SHOWN} more" if len(changed) > SHOWN else ""
@@ -92,21 +92,17 @@ def reachable(start: list[str]) -> set[str]:
 @functools.cache
 def imported(file: str) -> frozenset[str]:
     """List the files of this package that a file imports; what only type checkers see is left out."""
-    return frozenset().union(*map(_files_of, _modules(_content(file).decode())))
+    return frozenset().union(*(_files_named(*names) for names in _imports(_content(file).decode())))
 
 
-def _modules(text: str) -> Iterator[str]:
-    """Return the dotted names that import statements mention; of ``from a import b`` both a and a.b, which may be no module."""
+def _imports(text: str) -> Iterator[tuple[str, str, str]]:
+    """Return of each import statement a, b of ``from a import b`` and c of ``import c``."""
     unseen = [block.span() for block in _at_lines_with("if TYPE_CHECKING:", FOR_TYPE_CHECKERS, text)]
     for statement in _at_lines_with("slamcli", IMPORT, text):
         if any(first <= statement.start() < end for first, end in unseen):
             continue
-        home, names, plain = statement.groups()
-        if plain:
-            yield plain
-        else:
-            yield home
-            yield from (f"{home}.{name.split()[0]}" for name in names.split("#")[0].strip("() \n").split(",") if name.strip())
+        home, names, plain = statement.groups("")
+        yield home, names, plain
 
 
 def _at_lines_with(word: str, pattern: re.Pattern[str], text: str) -> Iterator[re.Match[str]]:
@@ -118,12 +114,20 @@ def _at_lines_with(word: str, pattern: re.Pattern[str], text: str) -> Iterator[r
         place = text.find(word, max(place + 1, found.end() if found else 0))
 
 
+@functools.cache  # one statement stands in many files
+def _files_named(home: str, names: str, plain: str) -> frozenset[str]:
+    """List the files that ``from home import names`` or ``import plain`` reads; a name may be a module or within one."""
+    below = "/".join([*home.split(".")[1:], ""])
+    listed = [below + name.split()[0] for name in names.split("#")[0].strip("() \n").split(",") if name.strip()]
+    return _files_of(plain or home).union(file for name in listed for file in (f"{name}.py", f"{name}/__init__.py") if file in _files())
+
+
 @functools.cache
-def _files_of(module: str) -> tuple[str, ...]:
-    """Return the file of a module, after those of the packages it lies in; what is no module gives those alone."""
+def _files_of(module: str) -> frozenset[str]:
+    """Return the file of a module and those of the packages it lies in; what is no module gives those alone."""
     parts = module.split(".")[1:]
     packages = ["/".join([*parts[:k], "__init__.py"]) for k in range(len(parts) + 1)]
-    return tuple(file for file in [*packages, "/".join(parts) + ".py"] if file in _files())
+    return _files() & {*packages, "/".join(parts) + ".py"}
 
 
 @functools.cache

@@ -90,7 +90,7 @@ def _changed_code(record: Mapping[str, Any], code: Mapping[str, str]) -> str:
 
 
 def _changed_config(recorded: Mapping[str, Any], now: Mapping[str, Any]) -> str:
-    before, after = _flat(recorded), _flat(now)
+    before, after = ({}, {}) if recorded == now else (_flat(recorded), _flat(now))
     changes = [
         f"{name} {before.get(name, 'unset')} -> {after.get(name, 'unset')}"
         for name in sorted(before.keys() | after.keys())

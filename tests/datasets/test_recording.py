@@ -1,7 +1,10 @@
 """A recording as it is delivered: large pictures made smaller with their camera, masks, and frames that cannot be read."""
 
 import json
+import os
+from collections import Counter
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -9,7 +12,7 @@ import pytest
 from recordings import png, write_recording
 
 from slamcli.config.options import RecordingConfig
-from slamcli.datasets import open_dataset
+from slamcli.datasets import open_dataset, sources
 from slamcli.datasets.assembly import reduction_of
 
 
@@ -79,3 +82,15 @@ def test_seven_scenes_without_intrinsics_has_depth_of_a_camera_of_its_own(tmp_pa
     assert (dataset.reader, dataset.camera.fx, dataset.depth_camera.fx) == ("seven_scenes", 525.0, 585.0)
     assert np.isfinite(dataset.depth(0)).mean() > 0.75  # a Kinect's depth covers less than its colour picture
     assert any("registered to colour on reading (focal length 585.0 px, 25 mm aside)" in warning for warning in dataset.warnings)
+
+
+def test_the_file_system_is_asked_for_each_image_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder, asked = write_large(tmp_path / "phone"), Counter()
+    stat = SimpleNamespace(stat=lambda path: (asked.update([str(path)]), os.stat(path))[1], path=os.path)
+    monkeypatch.setattr(sources, "os", stat)
+    dataset = open_dataset(str(folder))
+    identity = dataset.digest()
+    assert set(asked.values()) == {1} and len(asked) >= 6
+    assert identity == open_dataset(str(folder)).digest() and set(asked.values()) == {2}
+    (folder / "rgb" / "1.jpg").write_bytes((folder / "rgb" / "1.jpg").read_bytes() + b" ")
+    assert open_dataset(str(folder)).digest() != identity

@@ -6,6 +6,7 @@ import os
 import shutil
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import fakes
@@ -14,7 +15,7 @@ import pytest
 from slamcli import files
 from slamcli.cli import evaluate
 from slamcli.config.options import Config
-from slamcli.errors import SlamError
+from slamcli.errors import Damaged, SlamError
 from slamcli.runs import damage, places
 from slamcli.runs.creation import writing
 from slamcli.runs.pipeline import Pipeline
@@ -141,6 +142,7 @@ def test_a_folder_of_something_else_is_never_taken_over(tmp_path: Path) -> None:
     ("text", "message"),
     [
         (f'{{"format": {FORMAT + 1}}}', f"a run of format {FORMAT + 1}, this slamcli reads {FORMAT}"),
+        (f'{{"format": {FORMAT - 1}, "sealed": "sha256:0"}}', f"a run of format {FORMAT - 1}, this slamcli reads {FORMAT}"),
         (f'{{"format": {FORMAT}}}', "not as slamcli wrote it; restore it with: slamcli.open_run("),
         ("{", "not valid JSON"),
         ("", "not valid JSON"),
@@ -191,6 +193,41 @@ def test_a_broken_record_is_damage(run: RunDir, text: str | None, reason: str) -
     path = run.path / "loop" / "stage.json"
     path.unlink() if text is None else path.write_text(text)
     assert state(run, "loop") == ("damaged", reason)
+
+
+def test_a_record_is_read_once_and_again_after_each_write(run: RunDir, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = run.path / "loop" / "stage.json"
+    time.sleep(2e-9 * files.TICK_NS)
+    record = run.record("loop")
+    with monkeypatch.context() as patch:
+        patch.setattr(files, "read_sealed", lambda path: pytest.fail("read again"))
+        run.record("loop").clear()  # a caller's own
+        assert RunDir(run.path).record("loop") == record
+    content = bytearray(path.read_bytes())
+    content[10] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(Damaged, match="loop/stage.json"):
+        run.record("loop")
+    files.write_sealed(path, {**record, "seconds": 99.0})
+    assert run.record("loop") == {**record, "seconds": 99.0}
+
+
+def test_a_record_is_read_again_where_the_clock_of_its_files_may_not_have_ticked(run: RunDir, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two writes within a tick give a file one time, and perhaps one size."""
+    now = time.time_ns()
+    monkeypatch.setattr(files, "version", lambda path: (1, 2, 3, now, now))
+    record = run.record("loop")
+    files.write_sealed(run.path / "loop" / "stage.json", {**record, "seconds": 99.0})
+    assert run.record("loop") == {**record, "seconds": 99.0}
+
+
+def test_no_more_records_are_kept_than_a_few_runs_have(run: RunDir, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(damage, "MOST_RECORDS", 3)
+    monkeypatch.setattr(damage, "_records", {})
+    time.sleep(2e-9 * files.TICK_NS)
+    for name in NAMES:
+        run.record(name)
+        assert len(damage._records) <= 3
 
 
 def test_a_file_in_the_place_of_a_stage_is_no_stage(run: RunDir, caplog: pytest.LogCaptureFixture) -> None:

@@ -104,7 +104,7 @@ def test_the_order_in_which_they_are_named_is_not_the_order_in_which_they_are_jo
     for number, names in enumerate(itertools.permutations(recordings)):
         targets = [str(recordings[name]) for name in names]
         run, dataset, _ = create_run(targets, resolve=lambda config: config or Config(), path=tmp_path / str(number))
-        assert {**run.info(), "created": "", "sealed": ""} == {**house.info(), "created": "", "sealed": ""}
+        assert {**run.info(), "created": ""} == {**house.info(), "created": ""}
         assert dataset.digest() == house.info()["digest"]
 
 
@@ -227,7 +227,7 @@ def test_a_lost_run_json_is_restored_with_its_recordings(grown: RunDir, tmp_path
     run, info = RunDir(tmp_path / "run"), grown.info()
     (run.path / "run.json").write_text("{")
     run.restore()
-    assert {**run.info(), "created": "", "sealed": ""} == {**info, "created": "", "sealed": ""}
+    assert {**run.info(), "created": ""} == {**info, "created": ""}
 
 
 def test_other_settings_make_every_recording_stale(grown: RunDir) -> None:
