@@ -30,44 +30,46 @@ ROLL_OVERS = (*(float(1 << bits) for bits in (8, 16, 24, 31, 32)), 60.0, 1000.0,
 
 @dataclass(frozen=True)
 class Clock:
-    """The stamps of one list as seconds."""
+    """The stamps of one stream as seconds."""
 
     stamp: np.ndarray  # (K,) float64 [s], strictly increasing
-    row: np.ndarray  # (K,) int64 rows of the list that they belong to: some may be left out, some moved
-    is_clock: bool  # the list told the time; else a rate was assumed
+    row: np.ndarray  # (K,) int64 rows of the stream that they belong to: some may be left out, some moved
+    is_clock: bool  # the stamps told the time; else a rate was assumed
     seconds: Callable[[np.ndarray], np.ndarray] | None = None  # how other stamps of this clock become seconds; None = they cannot
     warnings: list[str] = field(default_factory=list)
     shifts: tuple[float, ...] = ()  # [s] added to each of the sessions that were joined
 
 
-def read_clock(raw: np.ndarray | None, n: int, *, what: str, fps: float | None = None, shifts: tuple[float, ...] = ()) -> Clock:
-    """Turn the stamps of a list into seconds.
+def read_clock(
+    raw: np.ndarray | None, n: int, *, what: str, order: str = "", fps: float | None = None, shifts: tuple[float, ...] = ()
+) -> Clock:
+    """Turn the stamps of a stream into seconds.
 
-    raw : (n,) as written, None = there are none; what : names the list in warnings; fps : rate [Hz] of a list that is no clock;
-    shifts : those of another list of the same clock
+    raw : (n,) as written, None = there are none; what, order : the stream and the order of its images, for warnings; fps : rate [Hz] where stamps are no clock;
+    shifts : those of another stream of the same clock
     Sound stamps in seconds come out as they are, bit for bit.
     """
     if n == 0:
         return Clock(np.empty(0), np.empty(0, dtype=np.int64), is_clock=False)
     if raw is None:
-        return _assumed(n, fps, f"{what}: has no time stamps")
+        return _assumed(n, fps, f"{what}: has no time stamps", order)
     finite = np.isfinite(raw)
     if finite.sum() < max(1, n / 2):
-        return _assumed(n, fps, f"{what}: most time stamps are no numbers")
+        return _assumed(n, fps, f"{what}: most time stamps are no numbers", order)
     rows, values = np.flatnonzero(finite), np.asarray(raw, dtype=np.float64)[finite]
     warnings = [f"{what}: {n - len(rows)} frames without a time stamp left out"] if len(rows) < n else []
-    found = _judge(values, what, fps, shifts)
+    found = _judge(values, what, order, fps, shifts)
     return replace(found, row=rows[found.row], warnings=warnings + found.warnings)
 
 
-def _judge(raw: np.ndarray, what: str, fps: float | None, shifts: tuple[float, ...]) -> Clock:
+def _judge(raw: np.ndarray, what: str, order: str, fps: float | None, shifts: tuple[float, ...]) -> Clock:
     """Decide what finite stamps are."""
     n, step = len(raw), np.diff(raw)
     if n == 1:
         per_second = UNITS[_unit_of_epoch(raw) or "s"]
         return Clock(raw / per_second, np.zeros(1, dtype=np.int64), True, lambda other: other / per_second)
     if (step == 0).mean() > MANY_REPEATED:
-        return _repeated(raw, what, fps)
+        return _repeated(raw, what, order, fps)
     if _are_frame_numbers(raw):
         return _numbers(raw, what, fps)
     unit, is_plausible = _unit(raw)
@@ -76,7 +78,7 @@ def _judge(raw: np.ndarray, what: str, fps: float | None, shifts: tuple[float, .
     told = [f"{what}: stamps are in {unit}; read as such"] if unit != "s" else []
     back = int((step < 0).sum())
     if back == 0:
-        return _ordered(seconds, per_second, what, told) if is_plausible else _assumed(n, fps, _hasty(what, seconds))
+        return _ordered(seconds, per_second, what, told) if is_plausible else _assumed(n, fps, _hasty(what, seconds), order)
     unrolled = _unrolled(raw)
     if unrolled is not None:
         kept = np.flatnonzero(np.concatenate([[True], np.diff(unrolled) > 0]))
@@ -88,7 +90,9 @@ def _judge(raw: np.ndarray, what: str, fps: float | None, shifts: tuple[float, .
         return _joined(seconds, stretches, what, told, shifts)
     is_regular = _is_regular(raw)
     if (back > MANY_BACK * (n - 1) and n >= ENOUGH and not is_regular) or not is_plausible:
-        return _assumed(n, fps, f"{what}: stamps go back {back} times and show no even pace, so they are no clock (processing times?)")
+        return _assumed(
+            n, fps, f"{what}: stamps go back {back} times and show no even pace, so they are no clock (processing times?)", order
+        )
     return _ordered(seconds, per_second, what, told)
 
 
@@ -105,10 +109,10 @@ def _ordered(seconds: np.ndarray, per_second: float, what: str, told: list[str])
     return Clock(seconds[order], order, True, lambda other: other / per_second, told)
 
 
-def _assumed(n: int, fps: float | None, why: str) -> Clock:
-    """Keep the list's order at a rate."""
+def _assumed(n: int, fps: float | None, why: str, order: str) -> Clock:
+    """Keep the order of the images at a rate."""
     rate = fps or ASSUMED_RATE
-    return Clock(np.arange(n) / rate, np.arange(n), False, None, [f"{why}; {_rate_told(rate, fps)}, in the list's order"])
+    return Clock(np.arange(n) / rate, np.arange(n), False, None, [f"{why}; {_rate_told(rate, fps)}, {order}"])
 
 
 def _rate_told(rate: float, fps: float | None) -> str:
@@ -123,16 +127,16 @@ def _numbers(raw: np.ndarray, what: str, fps: float | None) -> Clock:
     return Clock(found.stamp, found.row, False, lambda other: np.asarray(other) / rate, warnings)
 
 
-def _repeated(raw: np.ndarray, what: str, fps: float | None) -> Clock:
+def _repeated(raw: np.ndarray, what: str, order: str, fps: float | None) -> Clock:
     """Read stamps of which many are equal: whole seconds tell the rate, anything else does not."""
     values, counts = np.unique(raw, return_counts=True)
     is_counting = len(values) >= 4 and (np.diff(raw) >= 0).all() and (np.diff(values) == 1).mean() > MOSTLY_ONE
     rate = float(counts[1:-1].mean()) if is_counting else 0.0
     if fps is None and RATES[0] <= rate <= RATES[1]:
-        message = f"{what}: stamps are whole seconds; {rate:.1f} Hz taken from how many frames share one, in the list's order"
+        message = f"{what}: stamps are whole seconds; {rate:.1f} Hz taken from how many frames share one, {order}"
         return Clock(raw[0] + np.arange(len(raw)) / rate, np.arange(len(raw)), False, None, [message])
     repeated = int((np.diff(raw) == 0).sum())
-    return _assumed(len(raw), fps, f"{what}: {repeated} of {len(raw)} stamps repeat the one before, so they are no clock")
+    return _assumed(len(raw), fps, f"{what}: {repeated} of {len(raw)} stamps repeat the one before, so they are no clock", order)
 
 
 def _unit_of_epoch(raw: np.ndarray) -> str | None:

@@ -61,9 +61,9 @@ def _clock(stream: Stream, root: str, fps: float | None, *, is_paired: bool = Fa
     """Judge a stream's stamps, images written twice left out."""
     what = stream.where or root
     if stream.stamp is None or is_paired or not (is_copy := _copies(stream)).any():
-        return read_clock(stream.stamp, len(stream), what=what, fps=fps, shifts=shifts)
+        return read_clock(stream.stamp, len(stream), what=what, order=stream.order, fps=fps, shifts=shifts)
     rows = np.flatnonzero(~is_copy)
-    clock = read_clock(np.asarray(stream.stamp)[rows], len(rows), what=what, fps=fps, shifts=shifts)
+    clock = read_clock(np.asarray(stream.stamp)[rows], len(rows), what=what, order=stream.order, fps=fps, shifts=shifts)
     said = f"{what}: {int(is_copy.sum())} images repeat the one before, stamp and content; left out"
     return replace(clock, row=rows[clock.row], warnings=[said, *clock.warnings])
 
@@ -128,7 +128,7 @@ def _by_list(found: Recorded, clock: Clock, warnings: list[str]) -> Pairs:
                 f"{found.root}: the stamps are no clock, and {len(colour)} colour and {len(depth)} depth images cannot be paired line by "
                 "line; write an associations.txt with lines 'stamp colour stamp depth'"
             )
-        how, row = "their place in the lists", clock.row.copy()
+        how, row = "their order", clock.row.copy()
     warnings.append(f"{found.root}: colour and depth are paired by {how}")
     return Pairs(clock, row, np.where(row >= 0, clock.stamp, np.nan), warnings)
 
@@ -142,7 +142,7 @@ def _no_association(found: Recorded, stamp: np.ndarray, depth_stamp: np.ndarray)
     gap = np.abs(stamp[:, None] - depth_stamp[np.stack([after, (after - 1).clip(0)], axis=1)])
     return (
         f"{found.root}: no depth image lies within {MAX_DIFFERENCE} s of a colour image (the nearest is {gap.min():.3f} s away); "
-        "check that both lists use one clock and one unit"
+        "check that both have one clock and one unit"
     )
 
 

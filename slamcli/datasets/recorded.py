@@ -15,16 +15,18 @@ from slamcli.formats.trajectory import read_tum
 from slamcli.geometry import se3
 from slamcli.schema import Trajectory
 
+LISTED, BY_NUMBER, BY_NAME = (f"in the order of {what}" for what in ("the list", "their numbers", "their names"))
 Truth = Callable[[Clock], Trajectory | None]
 
 
 @dataclass(frozen=True)
 class Stream:
-    """Images in the order of their list, with the stamps written there."""
+    """Images in the order in which the recording has them, with the stamps written there."""
 
     images: Images
     stamp: np.ndarray | None = None  # (N,) float64 in any unit, or no clock at all; None = there are none
-    where: str = ""  # names the list in warnings
+    where: str = ""  # names the list, folder or topic in warnings
+    order: str = "in the order of the recording"  # that the images have where no clock tells it, for warnings
 
     def __len__(self) -> int:
         return len(self.images.names)

@@ -50,7 +50,7 @@ def about_lists(dataset: Dataset, times: StampTiming) -> list[RecordingFinding]:
     findings = [
         RecordingFinding(NOTE, "size", message)
         if REDUCED in message
-        else RecordingFinding(WARNING, "lists", message, "the program puts this right; mend the list to be rid of the warning")
+        else RecordingFinding(WARNING, "lists", message, "put right on reading")
         for message in dataset.warnings
         if "depth_scale" not in message and "hold no reading" not in message
     ]
@@ -73,7 +73,7 @@ def about_lists(dataset: Dataset, times: StampTiming) -> list[RecordingFinding]:
                 WARNING,
                 "unmatched",
                 f"{n - n_with_depth} of {n} colour frames have no depth image within {timing.MAX_DIFFERENCE:g} s",
-                "compare the rates and the clocks of both lists",
+                "compare the rates and the clocks of both cameras",
             )
         )
     if n < 30:
@@ -91,7 +91,7 @@ def about_order(dataset: Dataset, times: StampTiming, seen: Pictures) -> list[Re
                 WARNING,
                 "order",
                 f"{len(times.misnamed)} frames have other stamps than their files' names say, the first is {dataset.colour_name[first]}",
-                "the stamps in the list are swapped or edited; restore the list",
+                "stamps were swapped or edited; restore those that were recorded",
             )
         )
     has_depth = np.array([bool(path) for path in dataset.depth_name])
@@ -225,10 +225,10 @@ def about_registration(dataset: Dataset, fit: RegistrationFinding, times: StampT
     if fit.lag is not None and not EXPECTED_LAG[0] <= fit.lag <= EXPECTED_LAG[1]:
         late = "late" if fit.lag > 0 else "early"
         message = f"depth stamps are {abs(fit.lag):.3f} s {late}: the edges of depth and colour meet only then"
-        findings.append(RecordingFinding(WARNING, "time offset", message, f"add {-fit.lag:+.3f} s to the stamps in the depth list"))
+        findings.append(RecordingFinding(WARNING, "time offset", message, f"add {-fit.lag:+.3f} s to the stamps of depth"))
     elif fit.lag is None and times.depth_names_offset is not None and abs(times.depth_names_offset) > 0.02:
         message = f"the depth stamps differ from their files' names by {times.depth_names_offset:+.3f} s"
         findings.append(
-            RecordingFinding(WARNING, "stamps", message, "the clock of depth was moved; restore the list unless that was meant")
+            RecordingFinding(WARNING, "stamps", message, "the clock of depth was moved; restore its stamps unless that was meant")
         )
     return findings

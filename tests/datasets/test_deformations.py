@@ -229,11 +229,11 @@ CASES = {
     "pairs with the truth before": Case(pairs(lambda i, t: f"{t:.6f} {i} 0 0 0 0 0 1 {t:.6f} rgb/{i}.png {t:.6f} depth/{i}.png"), holds=lambda s: truth_moves(s)),
     "pairs with the truth behind": Case(pairs(lambda i, t: f"{t:.6f} rgb/{i}.png {t:.6f} depth/{i}.png {t:.6f} {i} 0 0 0 0 0 1"), holds=lambda s: truth_moves(s)),
     "pairs with one stamp": Case(pairs(lambda i, t: f"{t:.6f} rgb/{i}.png depth/{i}.png")),
-    "pairs without stamps": Case(pairs(lambda i, t: f"rgb/{i}.png depth/{i}.png"), said="no time stamps"),
+    "pairs without stamps": Case(pairs(lambda i, t: f"rgb/{i}.png depth/{i}.png"), said="in the order of the list"),
     "pairs with frame numbers": Case(pairs(lambda i, t: f"{i} depth/{i}.png {i} rgb/{i}.png", name="assoc.txt"), said="frame numbers"),
     "pairs in csv": Case(pairs(lambda i, t: f"{t:.6f},rgb/{i}.png,{t:.6f},depth/{i}.png", name="associations.csv")),
     "pairs under another name": Case(pairs(lambda i, t: f"{t:.6f} rgb/{i}.png {t:.6f} depth/{i}.png", name="my_assoc_list.txt")),
-    "no list at all": Case(lambda d: [(d / f"{n}.txt").unlink() for n in ("rgb", "depth")], said="no time stamps"),
+    "no list at all": Case(lambda d: [(d / f"{n}.txt").unlink() for n in ("rgb", "depth")], said="in the order of their numbers"),
     # depth
     "readings at the type's maximum": Case(repaint(lambda i, raw: png(np.where(raw == 0, 65535, raw).astype(np.uint16))), holds=lambda s: np.isnan(s.depth(0)[0, :5]).all()),
     "16-bit tiff": Case(repaint(lambda i, raw: png(raw, ".tiff"), suffix=".tiff")),

@@ -5,7 +5,7 @@ from pathlib import Path
 from slamcli.datasets.calibration import find_calibration
 from slamcli.datasets.folder import Folder
 from slamcli.datasets.lists import PairList, read_pairs
-from slamcli.datasets.recorded import Recorded, Stream, Truth, truth_file, truth_of_columns
+from slamcli.datasets.recorded import LISTED, Recorded, Stream, Truth, truth_file, truth_of_columns
 from slamcli.datasets.sources import ImageFiles
 
 NAMES = (
@@ -32,8 +32,8 @@ def of_pairs(pairs: PairList, path: Path, *, reader: str, truth: Truth | None, d
     return Recorded(
         reader=reader,
         root=path,
-        colour=Stream(ImageFiles(path, pairs.colour), pairs.stamp, str(pairs.path)),
-        depth=Stream(ImageFiles(path, pairs.depth), pairs.depth_stamp, str(pairs.path)),
+        colour=Stream(ImageFiles(path, pairs.colour), pairs.stamp, str(pairs.path), LISTED),
+        depth=Stream(ImageFiles(path, pairs.depth), pairs.depth_stamp, str(pairs.path), LISTED),
         calibration=find_calibration(path),
         is_paired=True,
         depth_scale=depth_scale,

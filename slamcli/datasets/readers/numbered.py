@@ -19,7 +19,7 @@ from slamcli.datasets.folder import (
     numbered,
     subfolder,
 )
-from slamcli.datasets.recorded import Recorded, Stream
+from slamcli.datasets.recorded import BY_NAME, BY_NUMBER, Recorded, Stream
 from slamcli.datasets.sources import ConfidentDepth, ImageFiles
 from slamcli.errors import BadFrame, SlamError
 
@@ -80,7 +80,7 @@ def _paired(
     depths, shifted = in_step(list(pictures), depths, path)
     if not any(number in depths for number in pictures):
         raise SlamError(
-            f"{path}: none of {len(pictures)} colour images has the number of one of {len(depths)} depth images; "
+            f"{path}: none of {_told(pictures, 'colour')} has the number of one of {_told(depths, 'depth')}; "
             "write an associations.txt with lines 'stamp colour stamp depth'"
         )
     numbers = list(pictures)
@@ -89,13 +89,18 @@ def _paired(
     return Recorded(
         reader=reader,
         root=path,
-        colour=Stream(ImageFiles(path, list(pictures.values())), None, str(path)),
-        depth=Stream(source, None, str(path)),
+        colour=Stream(ImageFiles(path, list(pictures.values())), None, str(path), BY_NUMBER),
+        depth=Stream(source, None, str(path), BY_NUMBER),
         calibration=calibration,
         is_paired=True,
         depth_scale=depth_scale,
         warnings=shifted + said,
     )
+
+
+def _told(images: dict[int, str], kind: str) -> str:
+    first = next(iter(images.values()), "")
+    return f"{len(images)} {kind} images" + (f" (the first: {first})" if first else "")
 
 
 def _stamped(
@@ -109,7 +114,7 @@ def _stamped(
             return None
         stamp = np.array([float(Path(name).stem) for name in files])
         order = np.argsort(stamp, kind="stable")
-        streams.append(Stream(ImageFiles(path, [f"{below}/{files[i]}" for i in order]), stamp[order], str(path / below)))
+        streams.append(Stream(ImageFiles(path, [f"{below}/{files[i]}" for i in order]), stamp[order], str(path / below), BY_NAME))
     return Recorded(reader=reader, root=path, colour=streams[0], depth=streams[1], calibration=calibration, depth_scale=depth_scale)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from slamcli.datasets.calibration import Calibration, find_calibration
 from slamcli.datasets.folder import DEPTH_SUFFIXES, IMAGE_SUFFIXES, Folder, number_of
-from slamcli.datasets.recorded import Recorded, Stream, Truth, read_matrices, truth_when_asked
+from slamcli.datasets.recorded import BY_NUMBER, Recorded, Stream, Truth, read_matrices, truth_when_asked
 from slamcli.datasets.sources import ImageFiles
 from slamcli.errors import SlamError
 
@@ -31,8 +31,8 @@ def read(path: Path) -> Recorded:
     return Recorded(
         reader="replica",
         root=path,
-        colour=Stream(ImageFiles(path, list(colour.values())), None, str(path)),
-        depth=Stream(ImageFiles(path, [depth.get(number, "") for number in colour]), None, str(path)),
+        colour=Stream(ImageFiles(path, list(colour.values())), None, str(path), BY_NUMBER),
+        depth=Stream(ImageFiles(path, [depth.get(number, "") for number in colour]), None, str(path), BY_NUMBER),
         calibration=_calibration(path),
         is_paired=True,
         depth_scale=DEPTH_SCALE,

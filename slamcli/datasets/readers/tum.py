@@ -7,7 +7,7 @@ from slamcli.datasets.calibration import find_calibration
 from slamcli.datasets.clock import read_clock
 from slamcli.datasets.folder import Folder
 from slamcli.datasets.lists import read_list
-from slamcli.datasets.recorded import Recorded, Stream, truth_file
+from slamcli.datasets.recorded import LISTED, Recorded, Stream, truth_file
 from slamcli.datasets.sources import ImageFiles
 
 DEPTH_SCALE = 5000.0  # of the TUM data set and of ETH3D, where a calibration is known and says nothing of it
@@ -31,8 +31,8 @@ def read(path: Path) -> Recorded:
     return Recorded(
         reader="tum",
         root=path,
-        colour=Stream(ImageFiles(path, colour.names), colour.stamp, str(colour.path)),
-        depth=Stream(ImageFiles(path, depth.names), depth.stamp, str(depth.path)),
+        colour=Stream(ImageFiles(path, colour.names), colour.stamp, str(colour.path), LISTED),
+        depth=Stream(ImageFiles(path, depth.names), depth.stamp, str(depth.path), LISTED),
         calibration=calibration,
         depth_scale=DEPTH_SCALE if calibration.source.endswith("calibration.txt") else None,
         truth=truth_file(path / "groundtruth.txt"),
