@@ -3,6 +3,7 @@
 import ast
 import re
 import shlex
+import textwrap
 import tomllib
 from pathlib import Path
 
@@ -57,6 +58,13 @@ def test_the_camera_file_in_the_documents_is_whole_and_right() -> None:
     text = re.search(r"```toml\n(.*?)```", (ROOT / "docs" / "robot.md").read_text(encoding="utf-8"), re.S).group(1)
     camera = Camera.from_dict(tomllib.loads("\n".join(line.strip() for line in text.splitlines())), source="docs/robot.md")
     assert (camera.width, camera.height, camera.depth_scale) == (640, 480, 1000.0)
+
+
+def test_what_the_documents_give_to_launch_is_python() -> None:
+    found = re.findall(r"^   ```python\n(.*?)^   ```", (ROOT / "docs" / "robot.md").read_text(encoding="utf-8"), re.M | re.S)
+    nodes = [node for block in found for node in ast.walk(ast.parse(textwrap.dedent(block))) if isinstance(node, ast.Call)]
+    packages = [word.value.value for node in nodes for word in node.keywords if word.arg == "package"]
+    assert packages[:2] == ["nav2_map_server", "nav2_amcl"] and {"pointcloud_to_laserscan", "depthimage_to_laserscan"} < set(packages)
 
 
 def test_every_layout_that_opens_has_a_row() -> None:
