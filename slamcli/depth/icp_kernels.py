@@ -7,6 +7,7 @@ from numba import boolean, f4, f8, i4, i8
 
 from slamcli.geometry.cholesky import solve_damped
 from slamcli.geometry.se3 import left_update
+from slamcli.geometry.six import six, store
 from slamcli.jit.kernel import kernel
 
 Z_MIN = 0.05  # [m] a point nearer to the image plane than this, or behind it, falls on nothing
@@ -103,8 +104,8 @@ def _normal_equations(T, source, target, view, now, rule, out):
     min_cosine, limit, _ = rule
     every, reach, is_final = now
     H, b = out
-    h00 = h01 = h02 = h03 = h04 = h05 = h11 = h12 = h13 = h14 = h15 = h22 = h23 = h24 = h25 = 0.0
-    h33 = h34 = h35 = h44 = h45 = h55 = b0 = b1 = b2 = b3 = b4 = b5 = cost = 0.0
+    h0 = h1 = h2 = h3 = h4 = h5 = g = six(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    cost = 0.0
     T00, T01, T02, T03, T10, T11, T12, T13 = T[0, 0], T[0, 1], T[0, 2], T[0, 3], T[1, 0], T[1, 1], T[1, 2], T[1, 3]
     T20, T21, T22, T23 = T[2, 0], T[2, 1], T[2, 2], T[2, 3]
     met, agree = 0, 0
@@ -129,43 +130,23 @@ def _normal_equations(T, source, target, view, now, rule, out):
         cost += w * chi2
         w /= variance
         n3, n4, n5 = qy * n2 - qz * n1, qz * n0 - qx * n2, qx * n1 - qy * n0
-        b0 -= w * r * n0
-        b1 -= w * r * n1
-        b2 -= w * r * n2
-        b3 -= w * r * n3
-        b4 -= w * r * n4
-        b5 -= w * r * n5
+        n = six(n0, n1, n2, n3, n4, n5)
+        g = g - (w * r) * n
         if is_final:
             m3, m4, m5 = qy * m2 - qz * m1, qz * m0 - qx * m2, qx * m1 - qy * m0
         else:
             m0, m1, m2, m3, m4, m5 = n0, n1, n2, n3, n4, n5
+        m = six(m0, m1, m2, m3, m4, m5)
         w *= 0.5
-        h00 += w * (n0 * m0 + m0 * n0)
-        h01 += w * (n0 * m1 + m0 * n1)
-        h02 += w * (n0 * m2 + m0 * n2)
-        h03 += w * (n0 * m3 + m0 * n3)
-        h04 += w * (n0 * m4 + m0 * n4)
-        h05 += w * (n0 * m5 + m0 * n5)
-        h11 += w * (n1 * m1 + m1 * n1)
-        h12 += w * (n1 * m2 + m1 * n2)
-        h13 += w * (n1 * m3 + m1 * n3)
-        h14 += w * (n1 * m4 + m1 * n4)
-        h15 += w * (n1 * m5 + m1 * n5)
-        h22 += w * (n2 * m2 + m2 * n2)
-        h23 += w * (n2 * m3 + m2 * n3)
-        h24 += w * (n2 * m4 + m2 * n4)
-        h25 += w * (n2 * m5 + m2 * n5)
-        h33 += w * (n3 * m3 + m3 * n3)
-        h34 += w * (n3 * m4 + m3 * n4)
-        h35 += w * (n3 * m5 + m3 * n5)
-        h44 += w * (n4 * m4 + m4 * n4)
-        h45 += w * (n4 * m5 + m4 * n5)
-        h55 += w * (n5 * m5 + m5 * n5)
-    b[0], b[1], b[2], b[3], b[4], b[5] = b0, b1, b2, b3, b4, b5
-    H[0, 0], H[0, 1], H[0, 2], H[0, 3], H[0, 4], H[0, 5] = h00, h01, h02, h03, h04, h05
-    H[1, 1], H[1, 2], H[1, 3], H[1, 4], H[1, 5] = h11, h12, h13, h14, h15
-    H[2, 2], H[2, 3], H[2, 4], H[2, 5] = h22, h23, h24, h25
-    H[3, 3], H[3, 4], H[3, 5], H[4, 4], H[4, 5], H[5, 5] = h33, h34, h35, h44, h45, h55
+        h0 = h0 + w * (n0 * m + m0 * n)
+        h1 = h1 + w * (n1 * m + m1 * n)
+        h2 = h2 + w * (n2 * m + m2 * n)
+        h3 = h3 + w * (n3 * m + m3 * n)
+        h4 = h4 + w * (n4 * m + m4 * n)
+        h5 = h5 + w * (n5 * m + m5 * n)
+    store(b.reshape(1, 6), 0, g)
+    for i, h in enumerate((h0, h1, h2, h3, h4, h5)):
+        store(H, i, h)
     return met, agree, cost
 
 

@@ -9,9 +9,10 @@ and with depth.
 from typing import NamedTuple
 
 import numpy as np
-from numba import f8, i4, i8, u8, uint64
+from numba import f8, i4, i8, u8
 
 from slamcli.geometry.se3 import left_update
+from slamcli.geometry.six import load, screw, six, store
 from slamcli.jit.kernel import kernel
 
 Z_MIN = 1e-2  # [m] a landmark nearer to the image plane than this, or behind it, has no projection
@@ -34,23 +35,23 @@ class Sightings(NamedTuple):
 
 
 class NormalEquations(NamedTuple):
-    """The blocks of the normal equations; of U and V the upper triangles alone, b is minus the gradient."""
+    """The blocks of the normal equations; b is minus the gradient."""
 
     U: f8[:, :, ::1]  # (n, 6, 6) of the free key frames, by their left twists (rho, phi)
     b_c: f8[:, ::1]  # (n, 6)
-    V: f8[:, :, ::1]  # (L, 3, 3) of the landmarks
+    V: f8[:, ::1]  # (L, 6) upper triangles, of the landmarks
     b_l: f8[:, ::1]  # (L, 3)
     W: f8[:, :, ::1]  # (O, 3, 6) landmark by key frame, of each observation
 
     @classmethod
     def empty(cls, n: int, n_landmarks: int, n_observations: int) -> "NormalEquations":
         """Make blocks for n free key frames, to be filled."""
-        shapes = (n, 6, 6), (n, 6), (n_landmarks, 3, 3), (n_landmarks, 3), (n_observations, 3, 6)
+        shapes = (n, 6, 6), (n, 6), (n_landmarks, 6), (n_landmarks, 3), (n_observations, 3, 6)
         return cls(*(np.empty(shape) for shape in shapes))
 
     def clear(self) -> None:
-        """Set to 0 what is summed over observations."""
-        for block in (self.U, self.b_c, self.V, self.b_l):
+        """Set to 0 what is summed over the landmarks."""
+        for block in (self.U, self.b_c):
             block.fill(0.0)
 
 
@@ -61,7 +62,7 @@ class ReducedBlocks(NamedTuple):
     S: f8[:, :, ::1]  # (B, 6, 6) blocks on and above the diagonal; of those on it only the upper triangle holds
     rhs: f8[:, ::1]  # (n, 6)
     V_inv: f8[:, ::1]  # (L, 6) upper triangles of the inverses of the damped V, 0 where a landmark is not observed
-    scratch: f8[:, :, ::1]  # (most observations of a landmark, 6, 3)
+    scratch: f8[:, :, ::1]  # (most observations of a landmark, 3, 6)
 
 
 class SharedGradient(NamedTuple):
@@ -98,7 +99,7 @@ def evaluate(at: Variables, seen: Sightings, measured: f8[:, ::1], camera: f8[::
 
 @kernel(error_model="numpy")
 def linearize(at: Variables, seen: Sightings, measured: f8[:, ::1], camera: f8[::1], limits: f8[::1], normal: NormalEquations):
-    """Add up the blocks of the normal equations with Huber's weights, in arrays that hold 0 before.
+    """Add up the blocks of the normal equations with Huber's weights; U and b_c are to hold 0 before.
 
     W = J_landmark^T w J_pose is written for free key frames alone.
 
@@ -114,16 +115,17 @@ def linearize(at: Variables, seen: Sightings, measured: f8[:, ::1], camera: f8[:
     fx, fy, cx, cy = camera[0], camera[1], camera[2], camera[3]
     for lm in range(len(x_w)):
         px, py, pz = x_w[lm, 0], x_w[lm, 1], x_w[lm, 2]
+        v00 = v01 = v02 = v11 = v12 = v22 = b0 = b1 = b2 = 0.0  # in registers; as arrays they would be written for each observation
         for o in range(offset[lm], offset[lm + 1]):
-            f, R, m = place[obs_kf[o]], T[obs_kf[o]], measured[o]
-            inv_px, inv_z = m[3], m[4]
-            x = R[0, 0] * px + R[0, 1] * py + R[0, 2] * pz + R[0, 3]
-            y = R[1, 0] * px + R[1, 1] * py + R[1, 2] * pz + R[1, 3]
-            z = R[2, 0] * px + R[2, 1] * py + R[2, 2] * pz + R[2, 3]
+            k, m = obs_kf[o], measured[o]
+            f, t, inv_px, inv_z = place[k], T[k], m[3], m[4]
+            r00, r01, r02, r10, r11, r12, r20, r21, r22 = t[0, 0], t[0, 1], t[0, 2], t[1, 0], t[1, 1], t[1, 2], t[2, 0], t[2, 1], t[2, 2]
+            x = r00 * px + r01 * py + r02 * pz + t[0, 3]
+            y = r10 * px + r11 * py + r12 * pz + t[1, 3]
+            z = r20 * px + r21 * py + r22 * pz + t[2, 3]
             if not (inv_px > 0.0 and z > Z_MIN):
-                for i in range(3 if f >= 0 else 0):
-                    for j in range(6):
-                        W[o, i, j] = 0.0
+                for j in range(3 if f >= 0 else 0):
+                    store(W[o], j, six(0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
                 continue
             a, b = fx / z * inv_px, fy / z * inv_px
             c, d = -a * x / z, -b * y / z
@@ -133,55 +135,35 @@ def linearize(at: Variables, seen: Sightings, measured: f8[:, ::1], camera: f8[:
             w = 1.0 if s <= limit else np.sqrt(limit / s)
             m00, m02, m11, m12, m22 = w * a * a, w * a * c, w * b * b, w * b * d, w * (c * c + d * d + inv_z * inv_z)
             q0, q1, q2 = w * a * ru, w * b * rv, w * (c * ru + d * rv + inv_z * rz)
-            for j in range(3):
-                r0, r1, r2 = R[0, j], R[1, j], R[2, j]
-                p0, p1, p2 = m00 * r0 + m02 * r2, m11 * r1 + m12 * r2, m02 * r0 + m12 * r1 + m22 * r2
-                b_l[lm, j] -= r0 * q0 + r1 * q1 + r2 * q2
-                for i in range(j + 1):
-                    V[lm, i, j] += R[0, i] * p0 + R[1, i] * p1 + R[2, i] * p2
-                if f >= 0:
-                    row = W[o, j]
-                    row[0], row[1], row[2], row[3], row[4], row[5] = p0, p1, p2, y * p2 - z * p1, z * p0 - x * p2, x * p1 - y * p0
+            b0 -= r00 * q0 + r10 * q1 + r20 * q2
+            b1 -= r01 * q0 + r11 * q1 + r21 * q2
+            b2 -= r02 * q0 + r12 * q1 + r22 * q2
+            # Columns of M R.
+            g0, g1, g2 = m00 * r00 + m02 * r20, m11 * r10 + m12 * r20, m02 * r00 + m12 * r10 + m22 * r20
+            h0, h1, h2 = m00 * r01 + m02 * r21, m11 * r11 + m12 * r21, m02 * r01 + m12 * r11 + m22 * r21
+            i0, i1, i2 = m00 * r02 + m02 * r22, m11 * r12 + m12 * r22, m02 * r02 + m12 * r12 + m22 * r22
+            v00 += r00 * g0 + r10 * g1 + r20 * g2
+            v01 += r00 * h0 + r10 * h1 + r20 * h2
+            v11 += r01 * h0 + r11 * h1 + r21 * h2
+            v02 += r00 * i0 + r10 * i1 + r20 * i2
+            v12 += r01 * i0 + r11 * i1 + r21 * i2
+            v22 += r02 * i0 + r12 * i1 + r22 * i2
             if f < 0:
                 continue
-            _add_to_key_frame(U[f], b_c[f], (x, y, z), (m00, m02, m11, m12, m22), (q0, q1, q2))
-
-
-@kernel(error_model="numpy")
-def _add_to_key_frame(u, g, x_c, M, q):
-    """Add [I; x_c^] M [I, -x_c^] to the upper triangle of u (6, 6), and -[q; x_c x q] to g (6,)."""
-    x, y, z = x_c
-    m00, m02, m11, m12, m22 = M
-    q0, q1, q2 = q
-    c03, c04, c05 = y * m02, z * m00 - x * m02, -y * m00
-    c13, c14, c15 = y * m12 - z * m11, -x * m12, x * m11
-    c23, c24, c25 = y * m22 - z * m12, z * m02 - x * m22, x * m12 - y * m02
-    u[0, 0] += m00
-    u[0, 2] += m02
-    u[0, 3] += c03
-    u[0, 4] += c04
-    u[0, 5] += c05
-    u[1, 1] += m11
-    u[1, 2] += m12
-    u[1, 3] += c13
-    u[1, 4] += c14
-    u[1, 5] += c15
-    u[2, 2] += m22
-    u[2, 3] += c23
-    u[2, 4] += c24
-    u[2, 5] += c25
-    u[3, 3] += y * c23 - z * c13
-    u[3, 4] += y * c24 - z * c14
-    u[3, 5] += y * c25 - z * c15
-    u[4, 4] += z * c04 - x * c24
-    u[4, 5] += z * c05 - x * c25
-    u[5, 5] += x * c15 - y * c05
-    g[0] -= q0
-    g[1] -= q1
-    g[2] -= q2
-    g[3] -= y * q2 - z * q1
-    g[4] -= z * q0 - x * q2
-    g[5] -= x * q1 - y * q0
+            store(W[o], 0, screw(x, y, z, g0, g1, g2))
+            store(W[o], 1, screw(x, y, z, h0, h1, h2))
+            store(W[o], 2, screw(x, y, z, i0, i1, i2))
+            u0, u1, u2 = screw(x, y, z, m00, 0.0, m02), screw(x, y, z, 0.0, m11, m12), screw(x, y, z, m02, m12, m22)
+            u = U[f]  # [I; x_c^] M [I, -x_c^]: its lower rows follow from the upper ones
+            store(u, 0, load(u, 0) + u0)
+            store(u, 1, load(u, 1) + u1)
+            store(u, 2, load(u, 2) + u2)
+            store(u, 3, load(u, 3) + (y * u2 - z * u1))
+            store(u, 4, load(u, 4) + (z * u0 - x * u2))
+            store(u, 5, load(u, 5) + (x * u1 - y * u0))
+            store(b_c, f, load(b_c, f) - screw(x, y, z, q0, q1, q2))
+        V[lm, 0], V[lm, 1], V[lm, 2], V[lm, 3], V[lm, 4], V[lm, 5] = v00, v01, v02, v11, v12, v22
+        b_l[lm, 0], b_l[lm, 1], b_l[lm, 2] = b0, b1, b2
 
 
 @kernel(error_model="numpy")
@@ -202,7 +184,7 @@ def eliminate(normal: NormalEquations, seen: Sightings, damping: f8, hold: f8[::
             rhs[f, i] = b_c[f, i]
     d = 1.0 + damping
     for lm in range(len(V)):
-        v00, v01, v02, v11, v12, v22 = d * V[lm, 0, 0], V[lm, 0, 1], V[lm, 0, 2], d * V[lm, 1, 1], V[lm, 1, 2], d * V[lm, 2, 2]
+        v00, v01, v02, v11, v12, v22 = d * V[lm, 0], V[lm, 1], V[lm, 2], d * V[lm, 3], V[lm, 4], d * V[lm, 5]
         c00, c01, c02 = v11 * v22 - v12 * v12, v02 * v12 - v01 * v22, v01 * v12 - v02 * v11
         det = v00 * c00 + v01 * c01 + v02 * c02
         q = 1.0 / det if det > 0.0 else 0.0
@@ -216,26 +198,17 @@ def eliminate(normal: NormalEquations, seen: Sightings, damping: f8, hold: f8[::
             if g < 0:
                 first = b + 1
                 continue
-            for i in range(6):
-                a0, a1, a2 = W[b, 0, i], W[b, 1, i], W[b, 2, i]
-                y0, y1, y2 = a0 * q00 + a1 * q01 + a2 * q02, a0 * q01 + a1 * q11 + a2 * q12, a0 * q02 + a1 * q12 + a2 * q22
-                rhs[g, i] -= y0 * b0 + y1 * b1 + y2 * b2
-                Y[b - first, i, 0], Y[b - first, i, 1], Y[b - first, i, 2] = y0, y1, y2
-            # Most of the time goes here. W in named variables stays in registers, as an array it would be read again after each store;
-            # unsigned rows spare the test for a negative index. Together 60 ns a block became 25.
-            w00, w01, w02, w03, w04, w05 = W[b, 0, 0], W[b, 0, 1], W[b, 0, 2], W[b, 0, 3], W[b, 0, 4], W[b, 0, 5]
-            w10, w11, w12, w13, w14, w15 = W[b, 1, 0], W[b, 1, 1], W[b, 1, 2], W[b, 1, 3], W[b, 1, 4], W[b, 1, 5]
-            w20, w21, w22, w23, w24, w25 = W[b, 2, 0], W[b, 2, 1], W[b, 2, 2], W[b, 2, 3], W[b, 2, 4], W[b, 2, 5]
-            for a in range(first, b + 1):
-                s, p = uint64(block_of[place[obs_kf[a]], g]), uint64(a - first)
+            w0, w1, w2 = load(W[b], 0), load(W[b], 1), load(W[b], 2)
+            y0, y1, y2 = q00 * w0 + q01 * w1 + q02 * w2, q01 * w0 + q11 * w1 + q12 * w2, q02 * w0 + q12 * w1 + q22 * w2
+            store(rhs, g, load(rhs, g) - (b0 * y0 + b1 * y1 + b2 * y2))
+            y = Y[b - first]
+            store(y, 0, y0)
+            store(y, 1, y1)
+            store(y, 2, y2)
+            for a in range(first, b + 1):  # most of the time goes here
+                s, y = S[block_of[place[obs_kf[a]], g]], Y[a - first]
                 for i in range(6):
-                    y0, y1, y2 = Y[p, i, 0], Y[p, i, 1], Y[p, i, 2]
-                    S[s, i, 0] -= y0 * w00 + y1 * w10 + y2 * w20
-                    S[s, i, 1] -= y0 * w01 + y1 * w11 + y2 * w21
-                    S[s, i, 2] -= y0 * w02 + y1 * w12 + y2 * w22
-                    S[s, i, 3] -= y0 * w03 + y1 * w13 + y2 * w23
-                    S[s, i, 4] -= y0 * w04 + y1 * w14 + y2 * w24
-                    S[s, i, 5] -= y0 * w05 + y1 * w15 + y2 * w25
+                    store(s, i, load(s, i) - (y[0, i] * w0 + y[1, i] * w1 + y[2, i] * w2))
 
 
 @kernel(error_model="numpy")
@@ -278,9 +251,9 @@ def step(
         d0 = V_inv[lm, 0] * g0 + V_inv[lm, 1] * g1 + V_inv[lm, 2] * g2
         d1 = V_inv[lm, 1] * g0 + V_inv[lm, 3] * g1 + V_inv[lm, 4] * g2
         d2 = V_inv[lm, 2] * g0 + V_inv[lm, 4] * g1 + V_inv[lm, 5] * g2
-        expected += d0 * (b_l[lm, 0] + damping * V[lm, 0, 0] * d0)
-        expected += d1 * (b_l[lm, 1] + damping * V[lm, 1, 1] * d1)
-        expected += d2 * (b_l[lm, 2] + damping * V[lm, 2, 2] * d2)
+        expected += d0 * (b_l[lm, 0] + damping * V[lm, 0] * d0)
+        expected += d1 * (b_l[lm, 1] + damping * V[lm, 3] * d1)
+        expected += d2 * (b_l[lm, 2] + damping * V[lm, 5] * d2)
         x_new[lm, 0], x_new[lm, 1], x_new[lm, 2] = x_w[lm, 0] + d0, x_w[lm, 1] + d1, x_w[lm, 2] + d2
     return expected
 

@@ -97,7 +97,7 @@ class Problem:
         self._loss, self._limits = loss, np.array(loss, dtype=np.float64)
         self.normal = NormalEquations.empty(len(free), len(x), len(obs_kf))
         self.rhs, self.V_inv = np.empty((len(free), 6)), np.empty((len(x), 6))
-        self._scratch = np.empty((int(np.diff(offset).max(initial=0)), 6, 3))
+        self._scratch = np.empty((int(np.diff(offset).max(initial=0)), 3, 6))
 
     # -- cost ---------------------------------------------------------------------------------------------------------------------
 

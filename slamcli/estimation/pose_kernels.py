@@ -13,6 +13,7 @@ from slamcli.estimation.robust_loss import Huber
 from slamcli.geometry import elementary
 from slamcli.geometry.cholesky import solve_damped
 from slamcli.geometry.se3 import left_update
+from slamcli.geometry.six import six, store
 from slamcli.jit.kernel import kernel
 
 Z_MIN = 1e-2  # [m] a landmark nearer to the image plane than this, or behind it, has no projection
@@ -123,8 +124,8 @@ def normal_equations(T, seen, is_used, camera, loss, out):
     H, b, chi2 = out
     fx, fy, cx, cy = camera[0], camera[1], camera[2], camera[3]
     robust = np.isfinite(loss.pixel) and np.isfinite(loss.with_depth)
-    h00 = h02 = h03 = h04 = h05 = h11 = h12 = h13 = h14 = h15 = h22 = h23 = h24 = h25 = 0.0
-    h33 = h34 = h35 = h44 = h45 = h55 = b0 = b1 = b2 = b3 = b4 = b5 = cost = 0.0
+    h0 = h1 = h2 = h3 = h4 = h5 = six(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    b0 = b1 = b2 = b3 = b4 = b5 = cost = 0.0
     for i in range(len(x_w)):
         px, py, pz = x_w[i, 0], x_w[i, 1], x_w[i, 2]
         z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
@@ -155,37 +156,22 @@ def normal_equations(T, seen, is_used, camera, loss, out):
         u3, u4, u5 = y * c, z * a - x * c, -y * a
         v3, v4, v5 = y * f - z * d, -x * f, x * d
         z3, z4 = y * e, -x * e
+        ju, jv, jz = six(a, 0.0, c, u3, u4, u5), six(0.0, d, f, v3, v4, v5), six(0.0, 0.0, e, z3, z4, 0.0)
         wa, wc, wd, wf, we = w * a, w * c, w * d, w * f, w * e
-        h00 += wa * a
-        h02 += wa * c
-        h03 += wa * u3
-        h04 += wa * u4
-        h05 += wa * u5
-        h11 += wd * d
-        h12 += wd * f
-        h13 += wd * v3
-        h14 += wd * v4
-        h15 += wd * v5
-        h22 += wc * c + wf * f + we * e
-        h23 += wc * u3 + wf * v3 + we * z3
-        h24 += wc * u4 + wf * v4 + we * z4
-        h25 += wc * u5 + wf * v5
-        h33 += w * (u3 * u3 + v3 * v3 + z3 * z3)
-        h34 += w * (u3 * u4 + v3 * v4 + z3 * z4)
-        h35 += w * (u3 * u5 + v3 * v5)
-        h44 += w * (u4 * u4 + v4 * v4 + z4 * z4)
-        h45 += w * (u4 * u5 + v4 * v5)
-        h55 += w * (u5 * u5 + v5 * v5)
+        h0 = h0 + wa * ju
+        h1 = h1 + wd * jv
+        h2 = h2 + (wc * ju + wf * jv + we * jz)
+        h3 = h3 + w * (u3 * ju + v3 * jv + z3 * jz)
+        h4 = h4 + w * (u4 * ju + v4 * jv + z4 * jz)
+        h5 = h5 + w * (u5 * ju + v5 * jv)
         b0 -= wa * ru
         b1 -= wd * rv
         b2 -= wc * ru + wf * rv + we * rz
         b3 -= w * (u3 * ru + v3 * rv + z3 * rz)
         b4 -= w * (u4 * ru + v4 * rv + z4 * rz)
         b5 -= w * (u5 * ru + v5 * rv)
-    H[0, 0], H[0, 1], H[0, 2], H[0, 3], H[0, 4], H[0, 5] = h00, 0.0, h02, h03, h04, h05
-    H[1, 1], H[1, 2], H[1, 3], H[1, 4], H[1, 5] = h11, h12, h13, h14, h15
-    H[2, 2], H[2, 3], H[2, 4], H[2, 5] = h22, h23, h24, h25
-    H[3, 3], H[3, 4], H[3, 5], H[4, 4], H[4, 5], H[5, 5] = h33, h34, h35, h44, h45, h55
+    for i, h in enumerate((h0, h1, h2, h3, h4, h5)):
+        store(H, i, h)
     b[0], b[1], b[2], b[3], b[4], b[5] = b0, b1, b2, b3, b4, b5
     return cost
 
