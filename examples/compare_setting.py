@@ -16,7 +16,7 @@ import slamcli
 def main(recording: str = "demo", setting: str = "extract.features=500", folder: str = "runs/compare") -> None:
     """Make both runs and print a line for each."""
     default = slamcli.run(recording, path=Path(folder) / "default", until="loop")
-    copy = Path(folder) / "changed"
+    copy = Path(folder) / setting.replace("/", "_")  # each setting's own: a run keeps what it was given before
     if not copy.exists():
         shutil.copytree(default.path, copy)
     changed = slamcli.open_run(copy).update(settings=[setting], until="loop")

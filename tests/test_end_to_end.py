@@ -43,6 +43,7 @@ def start(*arguments: str, **environment: str) -> subprocess.Popen:
 def test_every_stage_leaves_its_files_and_is_up_to_date(room_run: Path, slamcli: Callable[..., Result]) -> None:
     rows = json.loads(slamcli("status", "-r", room_run, "--verify", "--json").stdout)
     assert {row["stage"]: row["state"] for row in rows} == dict.fromkeys(NAMES, "up to date")
+    assert list(FILES) == list(NAMES)
     for stage, files in FILES.items():
         assert files <= set(os.listdir(room_run / stage)), stage
 

@@ -161,7 +161,7 @@ class TrackConfig:
     search_ratio: float = option(0.8, "best against second best distance of the same octave", gt=0, le=1)
     local_key_frames: int = option(20, "key frames whose landmarks are looked for in a frame", ge=1, le=1000)
     relocalize_candidates: int = option(5, "key frames tried after loss, best word score first", ge=1, le=1000)
-    relocalize_inliers: int = option(45, "landmarks that must agree to recognize a place after loss; as for a closure", ge=4, le=20_000)
+    relocalize_inliers: int = option(45, "landmarks that must agree to recognize a place after loss", ge=4, le=20_000)
     segment_after: int = option(10, "frames lost in a row at which a new map segment begins; 0 = never", ge=0, le=1_000_000)
     key_frame_share: float = option(0.6, "key frame where less than this share of its reference's landmarks or depth is left", gt=0, le=1)
     key_frame_gap: int = option(8, "frames after which another key frame is made, unless the place is crowded", ge=1, le=1_000_000)

@@ -12,6 +12,8 @@ from pathlib import Path
 
 import pytest
 
+import slamcli
+from slamcli.config.options import Config
 from slamcli.datasets import silent
 from slamcli.datasets.simulate import simulate
 from slamcli.depth.icp import Alignment
@@ -54,6 +56,13 @@ def test_compare_setting_prints_a_line_of_each_run_and_the_setting_matters(play,
     assert before.startswith("default") and after.startswith("extract.features=300")
     assert before.split("APE")[1] != after.split("APE")[1]
     assert "of 40 frames" in before
+
+
+def test_another_setting_is_compared_by_itself(play, here: Path, room: Path) -> None:
+    play("compare_setting.py", room, "extract.features=300", "both")
+    play("compare_setting.py", room, "loop.candidates=1", "both")
+    config = slamcli.open_run(here / "both" / "loop.candidates=1").config()
+    assert (config.loop.candidates, config.extract) == (1, Config().extract)
 
 
 def test_plan_path_stays_in_the_room(play, here: Path) -> None:
