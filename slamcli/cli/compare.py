@@ -38,4 +38,5 @@ def compare_command(runs: tuple[str, ...], out: Path | None, as_json: bool) -> N
     table = run_comparison.rows(found)
     if out is not None:
         files.write_text(out, comparison.render(table, found))
+        click.echo(f"{out}: the comparison as a page", err=True)
     click.echo(json.dumps([one.to_dict() for one in found], indent=1) if as_json else console.table(table))

@@ -90,10 +90,11 @@ def plan(
     from slamcli.schema import Grid
     from slamcli.visualization.grid_picture import Overlay, save_picture
 
-    trajectory = None
+    trajectory = height = None
     if page is None:
         folder = RunDir.find(run)
         grid = folder.load(Grid, "grid2d")
+        height = (folder.record("grid2d") or {})["config"]["grid2d"]["band_high"]
         warn_without_floor(folder)
         warn_of_doubt(folder)
         trajectory, title = camera_path(folder), str(folder.info()["dataset"])
@@ -105,7 +106,7 @@ def plan(
     if reachable:
         start = _ends(grid, {"start": start}, trajectory, radius=radius, allow_unknown=allow_unknown)[0]["start"]
         walls = _walls(folder, grid) if page is None else []
-        _tell_reachable(grid, start, radius, allow_unknown, walls, png, as_json)
+        _tell_reachable(grid, start, radius, height, allow_unknown, walls, png, as_json)
         return
     if goal is None:
         raise click.UsageError("give --goal, or --reachable")
@@ -128,7 +129,12 @@ def plan(
     click.echo(texts[".json" if as_json else ".csv"], nl=False)
     least = f"{float(route.clearance.min()) + radius:.2f} m"
     picture = f"; drawn in {png}" if png else ""
-    click.echo(f"{route.length:.2f} m, never nearer than {least} to what is not free{picture}", err=True)
+    click.echo(f"{route.length:.2f} m for {_robot(radius, height)}, never nearer than {least} to what is not free{picture}", err=True)
+
+
+def _robot(radius: float, height: float | None) -> str:
+    """Say for which robots a plan holds; the height of a map from elsewhere is not known."""
+    return f"a robot of {radius:g} m radius" + (f", up to {height:g} m high (grid2d.band_high)" if height is not None else "")
 
 
 def _fly(
@@ -183,7 +189,14 @@ def _walls(folder: RunDir, grid: Grid) -> list[Wall]:
 
 
 def _tell_reachable(
-    grid: Grid, start: tuple[float, float], radius: float, allow_unknown: bool, walls: list[Wall], png: Path | None, as_json: bool
+    grid: Grid,
+    start: tuple[float, float],
+    radius: float,
+    height: float | None,
+    allow_unknown: bool,
+    walls: list[Wall],
+    png: Path | None,
+    as_json: bool,
 ) -> None:
     """Print the area that a robot can get to from `start` and the rooms that it cannot, and draw what of the free floor it cannot."""
     from slamcli.navigation.reach import reach
@@ -198,11 +211,12 @@ def _tell_reachable(
             title=f"white: within reach of a robot of {radius:g} m radius",
         )
     if as_json:
-        click.echo(json.dumps({"start": _rounded(start), "radius": radius, **found.to_dict()}))
+        click.echo(json.dumps({"start": _rounded(start), "radius": radius, "height": height, **found.to_dict()}))
         return
     drawn = f"; drawn in {png}" if png else ""
     share = found.reached_area / found.free_area if found.free_area else 0.0
-    click.echo(f"{found.reached_area:.1f} of {found.free_area:.1f} m2 of free floor are within reach ({share:.0%}){drawn}")
+    area = f"{found.reached_area:.1f} of {found.free_area:.1f} m2 of free floor ({share:.0%})"
+    click.echo(f"{area} are within reach of {_robot(radius, height)}{drawn}")
     if found.gap is not None:
         click.echo(f"{found.area_beyond:.1f} m2 lie beyond {_told(found.gap)}")
     if found.rooms_left_out:
@@ -299,7 +313,7 @@ def _write(out: Path, texts: dict[str, str]) -> None:
     from slamcli import files
 
     if out.suffix not in texts:
-        raise SlamError(f"{out}: a path is written as .csv or .json")
+        raise SlamError(f"{out}: a path is written as .csv or .json; --png draws it")
     files.write_text(out, texts[out.suffix])
 
 

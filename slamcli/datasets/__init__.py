@@ -19,6 +19,7 @@ from slamcli.user_cache import user_cache
 __all__ = ["READERS", "Dataset", "open_dataset", "silent"]
 
 DEMO = "demo"
+FILES = (".bag", ".db", ".db3", ".mcap", ".mkv", ".r3d", ".sens")  # that may be recordings by themselves
 ARCHIVES = (".zip", ".gz", ".tgz", ".tar", ".7z", ".rar", ".bz2", ".xz")
 
 # Names of the literature for recordings whose folders are called otherwise.
@@ -59,7 +60,8 @@ def _not_a_recording(path: Path) -> str:
         return f"{path}: not a recording; give the folder of one, or a file of a kind that opens (see: {hint().layouts()})"
     if not path.is_dir():
         return f"{path}: a device or a pipe; give the folder of a recording, or a file of a kind that opens (see: {hint().layouts()})"
-    inner = [entry.name for entry in sorted(path.iterdir()) if entry.is_dir() and reader_of(entry) is not None]
+    entries = (entry for entry in sorted(path.iterdir()) if entry.is_dir() or entry.suffix.lower() in FILES)
+    inner = [entry.name for entry in entries if reader_of(entry) is not None]
     seen = "" if inner else describe(path)
     found = f"; recordings are in it: {', '.join(inner[:3])}" if inner else f"; {seen}" if seen else ""
     return f"{path}: not a recording{found}; see what opens and how it is told: {hint().layouts()}"

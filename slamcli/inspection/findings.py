@@ -50,7 +50,7 @@ def about_lists(dataset: Dataset, times: StampTiming) -> list[RecordingFinding]:
     findings = [
         RecordingFinding(NOTE, "size", message)
         if REDUCED in message
-        else RecordingFinding(WARNING, "lists", message, "put right on reading")
+        else RecordingFinding(WARNING, "lists", message, "" if "assumed" in message else "put right on reading")
         for message in dataset.warnings
         if "depth_scale" not in message and "hold no reading" not in message
     ]

@@ -316,11 +316,13 @@ def test_plan_tells_what_a_robot_can_reach(slamcli, run, tmp_path):
     wide = json.loads(slamcli("plan", "--start", "0,1", "--reachable", "-r", run, "--json", "--radius", 0.2).stdout)
     assert 0.9 * wide["free_m2"] < wide["reachable_m2"] < wide["free_m2"]
     fat = slamcli("plan", "--start", "0,1", "--reachable", "-r", run, "--radius", 0.8, "--png", tmp_path / "reach.png")
-    assert fat.exit_code == 0 and "within reach" in fat.stdout and (tmp_path / "reach.png").stat().st_size > 5000
+    robot = "a robot of 0.8 m radius, up to 0.5 m high (grid2d.band_high)"
+    assert fat.exit_code == 0 and f"are within reach of {robot}; drawn" in fat.stdout and (tmp_path / "reach.png").stat().st_size > 5000
     assert (
         json.loads(slamcli("plan", "--start", "0,1", "--reachable", "-r", run, "--json", "--radius", 0.8).stdout)["reachable_m2"]
         < 0.7 * wide["free_m2"]
     )
+    assert wide["height"] == 0.5
     assert slamcli("plan", "--start", "0,0", "-r", run).exit_code == 2
 
 

@@ -41,6 +41,13 @@ def test_both_kinds_under_other_names_are_told_which_names_open(tmp_path: Path) 
     assert "5 colour images in cam0/, 4 16-bit images in cam1/: name the folders rgb and depth, or list the pairs" in told
 
 
+def test_recordings_that_are_files_in_it_are_named(tmp_path: Path) -> None:
+    (tmp_path / "walk.mcap").write_bytes(b"\x89MCAP0\r\n")
+    (tmp_path / "old.bag").write_bytes(b"#ROSBAG V2.0\n")
+    (tmp_path / "notes.txt").touch()
+    assert "not a recording; recordings are in it: old.bag, walk.mcap; see" in refusal(tmp_path)
+
+
 def test_a_folder_of_other_things_is_told_nothing_of_images(tmp_path: Path) -> None:
     (tmp_path / "thesis.txt").touch()
     assert "not a recording; see what opens" in refusal(tmp_path)
