@@ -178,6 +178,12 @@ def stage_line(record: Mapping[str, Any], told: Sequence[str] | None) -> str:
     return "  ".join(parts)
 
 
+def _singular(word: str) -> str:
+    """Take the plural from "closures", "key frames" or "frames without depth"."""
+    noun, preposition, rest = word.partition(" without ")
+    return noun.removesuffix("s") + preposition + rest
+
+
 def warning_count(n: int) -> str:
     """Write a number of warnings."""
     return f"{n} warning{'s' * (n != 1)}"
@@ -194,6 +200,8 @@ def counts(summary: Mapping[str, Any], names: Sequence[str] | None = None) -> li
         ):
             continue
         word = name.replace("_", " ")
+        if type(value) is int and value == 1:
+            word = _singular(word)
         if isinstance(value, Mapping):
             found.append(f"{word}: {', '.join(f'{count} {kind}' for kind, count in value.items())}")
         elif isinstance(value, (bool, str)):

@@ -158,7 +158,12 @@ class Doubt:
     disagreement: np.ndarray = array("f4", "F", "m, between the motion within half a second as track and as loop found it, NaN = unknown")
     sigma: np.ndarray = array("f4", "F", "m, standard deviation of the position beside the frames around, NaN = lost")
     drift: np.ndarray = array("f4", "F", "m, the same beside the best held part of the recording, where things move; else 0")
-    is_doubtful: np.ndarray = array("?", "F", "whether the run does not trust the pose")
+    is_doubtful: np.ndarray = array("?", "F", "whether the run does not trust the pose; so of lost frames, which have none")
+
+    @property
+    def n_doubtful(self) -> int:
+        """Return how many of the frames that have a pose are doubtful."""
+        return int((self.is_doubtful & np.isfinite(self.sigma)).sum())
 
 
 @dataclass(frozen=True)

@@ -117,7 +117,7 @@ def _results(rng: np.random.Generator, truth: Trajectory, lost: np.ndarray, n_do
     track, loop = (_tracks(found[name].T_wc, kf_frame, lost) for name in ("track", "loop"))
     maps = {name: _map(T_wc[kf_frame], kf_frame) for name, T_wc in (("track", found["track"].T_wc), ("loop", found["loop"].T_wc))}
     when = Timing(readout=np.array(0.0), depth_readout=np.array(0.0), depth_delay=np.array(0.0), twist=np.zeros((frames, 6)))
-    unknown, sure = np.full(frames, np.nan, np.float32), np.full(frames, 0.003, np.float32)
+    unknown, sure = np.full(frames, np.nan, np.float32), np.where(lost, np.nan, 0.003).astype(np.float32)
     times = FrameTimes(stamp=truth.stamp, depth_stamp=truth.stamp)
     doubts = Doubt(
         contradicted=unknown,

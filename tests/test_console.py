@@ -63,6 +63,10 @@ def test_a_finished_stage_is_told_in_one_line() -> None:
     assert console.stage_line(record(), TOLD) == "track      1362 frames  14.2 s  95.9 fps  173 key frames"
     assert "3 warnings" in console.stage_line(record(n_warnings=3), TOLD)
     assert "4.5 s of it compiling kernels, this once" in console.stage_line(record(compile_seconds=4.5), TOLD)
+    ones = {"key_frames": 1, "frames_without_depth": 1, "lost": 1, "rms": 1.0}
+    assert console.stage_line(record(summary=ones, n_warnings=1), None).endswith(
+        "  1 key frame  1 frame without depth  1 lost  1 rms  1 warning"
+    )
     assert console.stage_line(record(summary={}, fps=None), TOLD) == "track      14.2 s"
 
 

@@ -38,7 +38,7 @@ def sure_figures(run: RunDir, found: Ape) -> dict[str, Any]:
         return {"doubtful": None, "rmse_sure": None}
     doubts = run.load(Doubt, "loop")
     error = found.error[~np.isin(found.stamp, run.load(FrameTimes, "loop").stamp[doubts.is_doubtful])]
-    return {"doubtful": int(doubts.is_doubtful.sum()), "rmse_sure": rmse(error) if len(error) else None}
+    return {"doubtful": doubts.n_doubtful, "rmse_sure": rmse(error) if len(error) else None}
 
 
 def frame_count(run: RunDir) -> int:

@@ -267,6 +267,9 @@ class Pipeline:
                 meter.add(seconds=begun.seconds, cpu_seconds=begun.cpu_seconds, peak_rss_mb=begun.peak_rss_mb)
             record = self._record(stage, inputs, damage.outputs(out), meter, tools, summary)
             self.run.commit(stage.name, out, record)
+        for finding in doubt.from_records({stage.name: record}):
+            if finding.text not in tools.warnings:
+                log.info("%s: %s", stage.name, finding.text)
         log.debug("%s: %s", stage.name, _done_line(record))
         self._tell(stage_line(record, stage.told))
         return_free_memory(meter.taken_mb)

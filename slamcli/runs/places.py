@@ -27,15 +27,14 @@ def find(run: str | None) -> Path:
 def named(run: str) -> Path:
     """Return the run directory that `run` names, a folder or a name under runs/, whether it is there yet or not.
 
-    What is a run counts first, here before under runs/. Of the others a folder that is here does, and a path with a separator means what
-    it says; a bare name is one under runs/.
+    What is a run counts first, here before under runs/. Else a bare name is one under runs/, unless a folder here is free to become the
+    run; a path with a separator means what it says.
     """
     if is_run(Path(run)):
         return Path(run)
     if is_run(RUNS / run):
         return RUNS / run
-    is_name = os.path.basename(run) == run and not Path(run).is_dir()
-    if not is_name:
+    if os.path.basename(run) != run or run in (os.curdir, os.pardir) or is_free(Path(run)):
         return Path(run)
     return _latest() if run == LATEST.name else default_path(run)
 
@@ -67,6 +66,11 @@ def default_path(dataset: str) -> Path:
     if not parts or ".." in parts or Path(dataset).is_absolute() or dataset == LATEST.name:
         raise SlamError(f"no run directory can be named after a recording called {dataset!r}; name one with {hint().argument('path')}")
     return RUNS / dataset
+
+
+def is_free(path: Path) -> bool:
+    """Say whether a folder holds nothing, so that it may become a run."""
+    return path.is_dir() and not any(not entry.name.startswith(".") for entry in path.iterdir())
 
 
 def is_run(path: Path) -> bool:

@@ -67,7 +67,7 @@ class RunDir:
         if recordings:
             about["recordings"] = [dict(entry) for entry in recordings]
         if not places.is_run(run.path):
-            if run.path.is_dir() and any(not entry.name.startswith(".") for entry in run.path.iterdir()):
+            if run.path.is_dir() and not places.is_free(run.path):
                 raise SlamError(f"{path}: the folder is not empty and not a run directory; name another with {hint().argument('path')}")
             if run.path.parent.name != RECORDINGS:  # where a run of several has those of each
                 places.refuse_inside(run.path)

@@ -21,7 +21,7 @@ def outcome(run: RunDir) -> str:
     if len(records) < len(NAMES):
         return ""
     said = doubt.headline(doubt.from_records(records))
-    n_warnings = sum(record["n_warnings"] for record in records.values())
+    n_warnings = sum(warned(run, stage).count for stage in records)
     rows = [
         _trajectory(records),
         *([name, text.format_map(records[stage]["summary"]), place] for name, stage, text, place in MADE),

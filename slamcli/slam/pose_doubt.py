@@ -119,8 +119,7 @@ def _edges(map_: Map, is_blind: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def findings(record: Doubt) -> list[Finding]:
     """Sum up what the frames' signs say of the run; a frame without a pose has none to be wrong."""
-    has_pose = np.isfinite(record.sigma)
-    n, n_poses = int(record.is_doubtful[has_pose].sum()), int(has_pose.sum())
+    n, n_poses = record.n_doubtful, int(np.isfinite(record.sigma).sum())
     if n == 0:
         return []
     share, contradicted = n / n_poses, float(np.nanmean(np.append(record.contradicted, 0.0)))

@@ -71,7 +71,7 @@ def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
         "lost": int((tracks.state == LOST).sum()),
         "apart": int((frame_segments(tracks, map_) > 0).sum()),
         "landmarks": len(map_.lm_xyz),
-        "doubtful": int(doubts.is_doubtful.sum()),
+        "doubtful": doubts.n_doubtful,
     }
     if several is not None:
         figures["recordings"] = several.counts()

@@ -142,8 +142,8 @@ def test_a_camera_given_once_stays_with_the_run(fake: Path, slamcli: Slamcli) ->
         (["run"], "make one with: slamcli run demo"),
         (["status"], "make one with: slamcli run demo"),
         (["track"], "make one with: slamcli run demo"),
-        (["status", "-r", "recordings"], "recordings: not a run directory"),
-        (["run", "recordings/desk", "-r", "recordings"], "the folder is not empty and not a run directory"),
+        (["status", "-r", "recordings"], "runs/recordings: not a run directory"),
+        (["run", "recordings/desk", "-r", "./recordings"], "the folder is not empty and not a run directory"),
     ],
 )
 def test_what_the_user_can_mend_is_one_line_and_status_1(fake: Path, slamcli: Slamcli, arguments: list[str], message: str) -> None:

@@ -104,6 +104,8 @@ def test_what_is_here_counts_before_a_name(tmp_path: Path, monkeypatch: pytest.M
     assert places.named("fast") == RunDir.find("fast").path == Path("fast")
     Path("slow").write_text("a file")
     assert places.named("slow") == Path("runs/slow")
+    Path("desk/rgb").mkdir(parents=True)
+    assert places.named("desk") == Path("runs/desk")  # the recording itself
 
 
 def test_latest_is_no_name_for_a_new_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

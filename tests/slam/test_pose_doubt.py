@@ -137,8 +137,9 @@ def test_a_fifth_of_the_poses_in_doubt_puts_the_run_in_doubt_and_the_lost_have_n
     record = judged(room()[1])
     sigma, is_doubtful = record.sigma.copy(), np.arange(FRAMES) < n_doubtful
     sigma[FRAMES - n_lost :], is_doubtful[FRAMES - n_lost :] = np.nan, True
-    (finding,) = pose_doubt.findings(replace(record, sigma=sigma, is_doubtful=is_doubtful))
-    assert finding.is_grave == is_grave and f"{n_doubtful} of {FRAMES - n_lost} frames" in finding.text
+    record = replace(record, sigma=sigma, is_doubtful=is_doubtful)
+    (finding,) = pose_doubt.findings(record)
+    assert record.n_doubtful == n_doubtful and finding.is_grave == is_grave and f"{n_doubtful} of {FRAMES - n_lost} frames" in finding.text
 
 
 @pytest.mark.parametrize(("contradicted", "is_told"), [(0.029, False), (0.031, True)])
