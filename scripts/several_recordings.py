@@ -1,12 +1,14 @@
 """Measure several recordings of one house in one map: one frame, the order, the cost of adding one, and joins that are wrong.
 
     python scripts/several_recordings.py FOLDER [--frames 240] [--width 640] [--seed 1] [--pairs 20] [--pair-width 160] [--first-pair 100]
+                                                [--orbslam3 PYTHON WORDS]
 
 Renders into FOLDER what is not there yet: four recordings of one room (other starts, directions and light, the same stamps, each
 seeing a part of what the next sees), and pairs of look-alike places, every second pair two corridors whose doors are all equal. Prints
 
 * the error of A, B and C in their common frame, together and each, and how far the maps of A B C and C A B part;
 * the cost of adding D in CPU seconds, beside a run of D alone and the common part, and its error beside that of a run of all four;
+* with --orbslam3, see orbslam3.py, what its atlas of maps makes of A, B and C handed over one after another;
 * of how many pairs of look-alike places the two were joined, and why the others were not.
 """
 
@@ -18,14 +20,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import rewritten
+import rivals
 
 from slamcli import api
 from slamcli.datasets import silent
 from slamcli.datasets.simulate import simulate
 from slamcli.evaluation import of_several, run_trajectories, trajectory_error
+from slamcli.formats.trajectory import write_tum
 from slamcli.runs.run_directory import RunDir
 from slamcli.runs.several import LAST
-from slamcli.schema import Map, Recordings
+from slamcli.schema import Map, Recordings, Trajectory
 from slamcli.stages import NAMES
 
 TAKES: dict[str, dict[str, Any]] = {
@@ -34,6 +39,7 @@ TAKES: dict[str, dict[str, Any]] = {
     "c": {"start": 0.3, "backwards": True, "light": 1.2, "take": 2},
     "d": {"start": 0.6, "light": 0.9, "take": 3},
 }
+PAUSE = 10.0  # [s] between recordings handed over one after another: ORB-SLAM3 gives a place up after 3
 FRONT = NAMES[: NAMES.index(LAST) + 1]  # stages of each recording alone
 
 
@@ -47,6 +53,7 @@ def main() -> None:
     parser.add_argument("--pairs", type=int, default=20)
     parser.add_argument("--pair-width", type=int, default=160)
     parser.add_argument("--first-pair", type=int, default=100, help="seed of the first pair; the others follow on it")
+    parser.add_argument("--orbslam3", nargs=2, metavar=("PYTHON", "WORDS"), help="also measure ORB-SLAM3")
     given = parser.parse_args()
     given.folder.mkdir(parents=True, exist_ok=True)
     os.chdir(given.folder)
@@ -55,6 +62,11 @@ def main() -> None:
         for name, how in TAKES.items()
     }
     one_house(takes)
+    if given.orbslam3:
+        python, words = (str(Path(path).absolute()) for path in given.orbslam3)
+        row = api.run(in_a_row(Path("house/abc"), [takes[name] for name in "abc"]), path="runs/in_a_row", until="extract").directory
+        found = rivals.orbslam3(row, python, words)
+        print(f"ORB-SLAM3 on A, B, C in a row: APE {1000 * (found['ape'] or np.nan):.2f} mm, {100 * found['coverage']:.1f} % of the frames")
     adding(takes)
     look_alikes(range(given.first_pair, given.first_pair + given.pairs), given.pair_width)
 
@@ -74,6 +86,28 @@ def one_house(takes: dict[str, Path]) -> None:
     T_wk = [run.load(Map, "loop").T_wk for run in runs]
     same = T_wk[0].shape == T_wk[1].shape
     print(f"A B C and C A B: {1000 * np.abs(T_wk[0] - T_wk[1])[:, :3, 3].max():.6f} mm apart at most" if same else "other key frames")
+
+
+def in_a_row(folder: Path, takes: Sequence[Path]) -> Path:
+    """Write one recording of several, each after the one before it and a pause, the truth in their common frame; what is there is kept."""
+    if folder.is_dir():
+        return folder
+    folder.mkdir(parents=True)
+    lists, stamp, T_wc, begin = {"rgb": "", "depth": ""}, [], [], 0.0
+    for take in takes:
+        listed = rewritten.listed(take)
+        shift = begin - listed.start
+        (folder / take.name).symlink_to(take.resolve())
+        for name, images in (("rgb", listed.colour), ("depth", listed.depth)):
+            lists[name] += "".join(f"{at + shift:.6f} {take.name}/{file}\n" for at, file in images)
+        stamp.append(listed.truth.stamp + shift)
+        T_wc.append(listed.truth.T_wc)
+        begin = float(stamp[-1].max()) + PAUSE
+    for name, text in lists.items():
+        (folder / f"{name}.txt").write_text(text)
+    (folder / "camera.json").write_bytes((takes[0] / "camera.json").read_bytes())
+    write_tum(folder / "groundtruth.txt", Trajectory(np.concatenate(stamp), np.concatenate(T_wc)))
+    return folder
 
 
 def adding(takes: dict[str, Path]) -> None:
