@@ -2,6 +2,7 @@
 
 import contextlib
 import fcntl
+import itertools
 import os
 import platform
 import re
@@ -20,6 +21,8 @@ from slamcli.hints import Hints, hint
 from slamcli.stages import NAMES
 
 LIST_SUFFIX = ".txt"
+MOST_RECORDINGS = 100_000  # of a batch
+MOST_PARTS = 16  # of a recording's path, from its end, that may be needed to name its run
 MARKER = ".batch-"  # begins the names of the files by which workers know a folder again
 
 
@@ -57,8 +60,11 @@ class Job:
 
 
 def jobs(recordings: Sequence[str], order: Order) -> list[Job]:
-    """Return each recording a run of its own, named after it; SlamError for none, and for one that is named twice."""
-    found = [_absolute(recording) for recording in _listed(recordings)]
+    """Return each recording a run of its own, named after it; SlamError for none, for one that is named twice, and for too many."""
+    listed = _listed(recordings)
+    if len(listed) > MOST_RECORDINGS:
+        raise SlamError(f"{len(listed)} recordings: a batch has at most {MOST_RECORDINGS}; divide the list")
+    found = [_absolute(recording) for recording in listed]
     if not found:
         raise SlamError("no recording to work off; name some, or a list of them: a .txt file with one a line")
     twice = [recording for recording, n in Counter(found).items() if n > 1]
@@ -90,14 +96,18 @@ def _absolute(recording: str) -> str:
 
 
 def names(recordings: Sequence[str]) -> list[str]:
-    """Name runs after their recordings: by the last part of the path, and where that is not unique by as many parts as it takes."""
-    parts = [[re.sub(r"[^A-Za-z0-9._-]", "_", part).lstrip(".") for part in re.split(r"[/\\]+", text) if part] for text in recordings]
+    """Name runs after their recordings: by the last part of the path, where that is not unique by as many parts as it takes, else by number."""
+    split = ([part for part in re.split(r"[/\\]+", text) if part] for text in recordings)
+    parts = [[re.sub(r"[^A-Za-z0-9._-]", "_", part).lstrip(".") for part in path[-MOST_PARTS:]] for path in split]
     found = ["" for _ in parts]
     for length in range(1, max(map(len, parts)) + 1):
         tried = ["-".join(p for p in part[-length:] if p) or "recording" for part in parts]
-        counts = Counter(tried)
-        found = [name or (new if counts[new] == 1 and new not in found else "") for name, new in zip(found, tried, strict=True)]
-    return [name or f"recording{k}" for k, name in enumerate(found)]
+        counts, taken = Counter(tried), {*found}
+        fits = [counts[new] == 1 and new not in taken and len(new) <= files.LONGEST_NAME for new in tried]
+        found = [name or (new if fit else "") for name, new, fit in zip(found, tried, fits, strict=True)]
+    taken = {*found}
+    numbered = (name for k in itertools.count() if (name := f"recording{k}") not in taken)
+    return [name or next(numbered) for name in found]
 
 
 def absolute_out(out: str) -> str:

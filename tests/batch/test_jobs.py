@@ -5,6 +5,7 @@ import errno
 import io
 import os
 import platform
+import time
 from pathlib import Path
 
 import pytest
@@ -23,6 +24,9 @@ from slamcli.stages import NAMES
         (["s3://bucket/walk.mcap", "tum/fr1_room", "demo"], ["walk.mcap", "fr1_room", "demo"]),
         (["/x/scan", "/y/x/scan", "s3://x/scan"], None),
         (["/data/..hidden ü", "/"], None),
+        (["/x/a b", "/x/a_b", "/recording1", "/recording0"], ["recording2", "recording3", "recording1", "recording0"]),
+        (["/x/" + "n" * 199, "/y/" + "n" * 199, "/z/" + "m" * 201], ["recording0", "recording1", "recording2"]),
+        (["s3://" + "a/" * 2_000_000, "s3://b/" + "a/" * 2_000_000], ["recording0", "recording1"]),
     ],
 )
 def test_runs_are_named_after_recordings_and_never_alike(recordings: list[str], names: list[str] | None) -> None:
@@ -41,11 +45,25 @@ def test_a_list_has_a_recording_a_line_and_comments(here: Path) -> None:
     assert found[0].stages == NAMES
 
 
+def test_a_long_list_is_named_in_a_time_that_grows_with_it() -> None:
+    start = time.process_time()
+    found = jobs.names([f"/data/{k // 2}/part{k % 2}" for k in range(50_000)])
+    assert found[-1] == "24999-part1" and len(set(found)) == 50_000
+    assert time.process_time() - start < 5.0
+
+
 @pytest.mark.parametrize(
-    "given, message", [(["demo", "demo"], "named twice"), (["empty.txt"], "no recording"), (["./a", "a"], "named twice")]
+    "given, message",
+    [
+        (["demo", "demo"], "named twice"),
+        (["empty.txt"], "no recording"),
+        (["./a", "a"], "named twice"),
+        (["long.txt"], "100001 recordings: a batch has at most 100000"),
+    ],
 )
 def test_what_is_no_batch_is_said(here: Path, given: list[str], message: str) -> None:
     (here / "empty.txt").write_text("# nothing\n")
+    (here / "long.txt").write_text("".join(f"room{k}\n" for k in range(100_001)))
     (here / "a").mkdir()
     with pytest.raises(SlamError, match=message):
         jobs.jobs(given, Order(out="/runs"))
