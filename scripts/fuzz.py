@@ -9,6 +9,8 @@ Each input is a good file with a few seeded mutations, so a run can be repeated;
 
 import argparse
 import contextlib
+import gzip
+import io
 import json
 import os
 import random
@@ -16,10 +18,12 @@ import resource
 import shutil
 import signal
 import sys
+import tarfile
 import tempfile
 import time
 import traceback
 import warnings
+import zipfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,11 +31,12 @@ from pathlib import Path
 import numpy as np
 
 from slamcli import artifacts, files
+from slamcli.batch import jobs
 from slamcli.cli.grid import kept_out
 from slamcli.config import toml
 from slamcli.config.options import Config
-from slamcli.console import stage_line
-from slamcli.datasets import images, open_dataset
+from slamcli.console import silent, stage_line
+from slamcli.datasets import download, images, open_dataset
 from slamcli.datasets.intrinsics import read_camera_file
 from slamcli.datasets.lists import read_list, read_pairs
 from slamcli.datasets.simulate import read_stamps
@@ -269,6 +274,13 @@ def parsers() -> dict[str, Parser]:
     def keep_out(path: Path) -> object:
         return kept_out(cells, path)
 
+    def unpacked(path: Path) -> object:
+        if path.suffix == ".tar":
+            path = path.with_suffix(".gz")
+            path.write_bytes(gzip.compress(path.with_suffix(".tar").read_bytes(), compresslevel=1))
+        shutil.rmtree(path.parent / "room", ignore_errors=True)
+        return download.unpack(path, path.parent / "room", progress=silent)
+
     def scene(path: Path) -> object:
         room = grid_truth.read_scene(path)
         grid_truth.cast(room, np.zeros(3), np.eye(3))
@@ -296,6 +308,10 @@ def parsers() -> dict[str, Parser]:
         "npy": Parser("x.npy", written("closure_T_ij.npy", lambda path: artifacts.save(closures, path.parent)), record),
         "scene": Parser("scene.json", (json.dumps(SCENE, indent=1).encode(),), scene),
         "stamps": Parser("stamps.txt", (b"# colour depth\n1.0 1.01\n1.04 1.05\n", b"1 2\n3 4\n"), read_stamps),
+        "batch_list": Parser("week.txt", (b"# this week\n/data/monday\n/data/b/monday  # again\ndemo\ns3://bucket/a/b\n",), lambda path: jobs.jobs([str(path)], jobs.Order(out="/runs"))),
+        "archive": Parser("run.zip", (packed("run/track/stage.json", "run/run.json"),), housekeeping.stages_in),
+        "tar": Parser("room.tar", (tarred("room/rgb.txt", "room/rgb/1.png"),), unpacked),
+        "tgz": Parser("room.tgz", (gzip.compress(tarred("room/rgb.txt", "room/rgb/1.png")),), unpacked),
         "keep_out": Parser("areas.json", (b"[[[0, -0.5], [0.1, -0.9], [0.2, -0.7]], [[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0, 1]]]",), keep_out),
         "mask": Parser("mask", tuple(encoded(kind, rng, depth=False) for kind in (".png", ".bmp")), lambda path: mask.read_mask(path, SIZE[::-1])),
         "rvl": Parser("rvl", (rvl.encode(rng.integers(0, 3, SIZE[::-1]) * rng.integers(500, 3000, SIZE[::-1])),), lambda path: rvl.decode(path.read_bytes(), *SIZE)),
@@ -410,6 +426,26 @@ def written(name: str, write: Callable[[Path], object]) -> tuple[bytes]:
         path = Path(folder) / name
         write(path)
         return (path.read_bytes(),)
+
+
+def packed(*names: str) -> bytes:
+    """Return a zip archive of files by these names."""
+    with io.BytesIO() as file:
+        with zipfile.ZipFile(file, "w") as archive:
+            for name in names:
+                archive.writestr(name, "{}")
+        return file.getvalue()
+
+
+def tarred(*names: str) -> bytes:
+    """Return a tar archive of files by these names."""
+    with io.BytesIO() as file:
+        with tarfile.open(fileobj=file, mode="w") as archive:
+            for name in names:
+                member = tarfile.TarInfo(name)
+                member.size = 9
+                archive.addfile(member, io.BytesIO(b"1.0 a.png"))
+        return file.getvalue()
 
 
 def fresh(folder: Path) -> Path:

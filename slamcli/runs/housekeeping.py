@@ -121,7 +121,7 @@ def archive(run: RunDir, out: Path, *, skip: Sequence[str] = (), overwrite: bool
         raise SlamError(f"{out}: lies in the run that is to be packed; choose another place")
     _check_intact(run, skip)
     chosen = [path for path in files_of(run) if path.relative_to(run.path).parts[0] not in skip]
-    lost = _stages_in(out) - {path.relative_to(run.path).parts[0] for path in chosen}
+    lost = stages_in(out) - {path.relative_to(run.path).parts[0] for path in chosen}
     if lost and not overwrite:
         there = ", ".join(name for name in NAMES if name in lost)
         raise SlamError(
@@ -139,7 +139,7 @@ def archive(run: RunDir, out: Path, *, skip: Sequence[str] = (), overwrite: bool
     return len(chosen)
 
 
-def _stages_in(archive: Path) -> set[str]:
+def stages_in(archive: Path) -> set[str]:
     """List the stages that an archive holds; none where there is no archive."""
     try:
         with zipfile.ZipFile(archive) as packed:
