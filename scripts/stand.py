@@ -28,7 +28,7 @@ COMMANDS: tuple[Command, ...] = (
     ("run", "-r", "run", "--from", "densify"),
     ("run", "ONE", "TWO", "-r", "./house", "--from", "track"),
     ("add", "grown", "TWO"),
-    ("batch", "ONE", "--out", "week", "--workers", "1"),
+    ("batch", "ONE", "TWO", "--out", "week", "--workers", "2"),
     ("export-trajectory", "out/t.txt", "-r", "run"),
     ("export-trajectory", "out/p.g2o", "-r", "run"),
     ("export-cloud", "out/cloud.ply", "-r", "run"),
@@ -126,9 +126,10 @@ class Stand:
         if command[0] == "add":
             shutil.rmtree("grown", ignore_errors=True)
             shutil.copytree("grown.before", "grown")
-        if command[0] == "batch":  # else there is nothing to do for it
-            for folder in Path("week").glob("*/densify"):
-                shutil.rmtree(folder)
+        if command[0] == "batch":  # it is to go on with one recording and to begin with the others
+            first, *others = sorted(path for path in Path("week").iterdir() if path.is_dir())
+            for folder in (first / "densify", *others):
+                shutil.rmtree(folder, ignore_errors=True)
 
     def contents(self, *tops: str) -> dict[str, str]:
         """Digest what must be the same whenever it is made."""
