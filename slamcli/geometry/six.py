@@ -91,19 +91,27 @@ def six(_typing, a, b, c, d, e, f):
 
 @intrinsic
 def load(_typing, rows, k):
-    """Return row k of rows (n, 6), a C-contiguous array of doubles; k is not tested."""
-    return SIX(rows, int64), lambda context, builder, of, given: builder.load(_address(context, builder, of, given), align=8)
+    """Return row k of rows (n, 6), a C-contiguous array of doubles; neither k nor the width is tested."""
+
+    def generate(context, builder, of, given):
+        return builder.load(_address(context, builder, of, given), align=8)
+
+    return (SIX(rows, int64), generate) if _are_rows(rows) else None
 
 
 @intrinsic
 def store(_typing, rows, k, lanes):
-    """Write row k of rows (n, 6), a C-contiguous array of doubles; k is not tested."""
+    """Write row k of rows (n, 6), a C-contiguous array of doubles; neither k nor the width is tested."""
 
     def generate(context, builder, of, given):
         builder.store(given[2], _address(context, builder, of, given), align=8)
         return context.get_dummy_value()
 
-    return types.void(rows, int64, SIX), generate
+    return (types.void(rows, int64, SIX), generate) if _are_rows(rows) and rows.mutable else None
+
+
+def _are_rows(of):
+    return isinstance(of, types.Array) and (of.dtype, of.ndim, of.layout) == (float64, 2, "C")
 
 
 def _address(context, builder, of, given):

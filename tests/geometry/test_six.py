@@ -1,6 +1,8 @@
 """Six doubles at once give what loops over them give, digit by digit."""
 
 import numpy as np
+import pytest
+from numba.core.errors import TypingError
 
 from slamcli.geometry import six as six_module
 from slamcli.geometry.six import load, screw, six, store
@@ -64,6 +66,14 @@ def test_rows_are_written_where_they_belong_and_nothing_beside_them() -> None:
         rows = memory[start : start + 30].reshape(5, 6)
         _combined(AWKWARD, 0.5, rows)
         assert (memory[:start] == 7.0).all() and (memory[start + 30 :] == 7.0).all()
+
+
+@pytest.mark.parametrize(
+    "rows", [np.ones((2, 6), np.float32), np.asfortranarray(AWKWARD), AWKWARD[None]], ids=["single", "by columns", "three axes"]
+)
+def test_other_arrays_are_refused_before_they_are_read(rows: np.ndarray) -> None:
+    with pytest.raises(TypingError):
+        _accumulated(rows, np.ones(2), np.empty((1, 6)))
 
 
 def test_a_screw_is_the_derivative_by_a_left_twist() -> None:
