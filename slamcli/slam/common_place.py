@@ -35,7 +35,7 @@ VIEWS = 6  # of the other segment, nearest first, that each key frame is compare
 NEAR_M, NEAR_COSINE = 0.5, 0.94  # apart, views whose pictures must be alike
 MOST_PAIRS = 60  # of these, evenly spread, are compared
 LEAST_AGREEMENT = 0.8  # of the surface that both saw
-LEAST_ALIKE = 0.5  # of the pairs of near views
+MOST_DIFFERENT = 0.5  # of the pairs of near views
 PLACE = 1.0  # [m] side of the cubes that pictures are compared in
 LEAST_EXPECTED = 100  # landmarks that views of a place should show, before it says anything
 # Share of these that is found, beside the share over all places. Of one place, the least alike had 0.39 of it; of two corridors that differ
@@ -49,20 +49,20 @@ MOVED_M, MOVED_RAD = 0.3, 0.1  # a closure that moves its view by less is one of
 class Comparison:
     """What two segments say of one another under a placement."""
 
-    agreement: float  # share of the surface that the other segment sees again, of that which it sees again or looks through
     n_pairs: int = 0  # pairs of views from nearly the same spot
-    n_alike: int = 0  # of these, pairs in which one shows the landmarks of the other
+    n_different: int = 0  # of these, pairs in which one does not show the landmarks of the other, counted until it is decided
     n_otherwise: int = 0  # places whose surface both saw, but hardly one landmark of the other
+    agreement: float = 1.0  # share of the surface that the other segment sees again, of that which it sees again or looks through
 
     @property
     def objection(self) -> str:
         """Say why the two cannot be one place, "" when they can."""
-        if not self.agreement >= LEAST_AGREEMENT:
-            return f"one side looks through {1.0 - self.agreement:.0%} of what would be one surface"
-        if self.n_alike < LEAST_ALIKE * self.n_pairs:
-            return f"{self.n_pairs - self.n_alike} of {self.n_pairs} pairs of views from nearly one spot show different things"
+        if self.n_different > MOST_DIFFERENT * self.n_pairs:
+            return f"more than {MOST_DIFFERENT:.0%} of {self.n_pairs} pairs of views from nearly one spot show different things"
         if self.n_otherwise > MOST_OTHERWISE:
             return f"{self.n_otherwise} places of {PLACE:g} m look different from the two sides, though their surfaces would be the same"
+        if not self.agreement >= LEAST_AGREEMENT:
+            return f"one side looks through {1.0 - self.agreement:.0%} of what would be one surface"
         return ""
 
 
@@ -113,21 +113,24 @@ class Jury:
         return self._weigh(a, b[b > a[-1]], move).objection
 
     def _weigh(self, a: np.ndarray, b: np.ndarray, T_ab: np.ndarray) -> Comparison:
-        """Compare the views of key frames b, moved by T_ab, with those of key frames a, until something speaks against the motion."""
+        """Compare the views of key frames b, moved by T_ab, with those of key frames a, until something speaks against the motion.
+
+        What costs least and speaks most often comes first.
+        """
         T_ak = np.array(self._sparse_map.kf.T_wk)
         T_ak[b] = product(T_ab, T_ak[b])
-        spot = T_ak[:, :3, 3] + AHEAD * T_ak[:, :3, 2]
-        apart = np.linalg.norm(spot[b][:, None] - spot[a], axis=2)
-        comparison = Comparison(self._agreement(T_ak, a, b, apart))
-        if not comparison.objection:
-            pairs = self._near_pairs(T_ak, a, b)
-            comparison = replace(comparison, n_pairs=len(pairs), n_alike=sum(self._are_alike(T_ak, *pair) for pair in pairs))
+        pairs = self._near_pairs(T_ak, a, b)
+        comparison = Comparison(len(pairs), self._count_different(T_ak, pairs))
         if not comparison.objection:
             looks = [(pair, np.eye(4)) for pair in pairs] + [(pair, T_ab) for pair in self._near_pairs(T_ak, b, a)]
             comparison = replace(comparison, n_otherwise=self._otherwise(T_ak, looks))
+        if not comparison.objection:
+            comparison = replace(comparison, agreement=self._agreement(T_ak, a, b))
         return comparison
 
-    def _agreement(self, T_ak: np.ndarray, a: np.ndarray, b: np.ndarray, apart: np.ndarray) -> float:
+    def _agreement(self, T_ak: np.ndarray, a: np.ndarray, b: np.ndarray) -> float:
+        spot = T_ak[:, :3, 3] + AHEAD * T_ak[:, :3, 2]
+        apart = np.linalg.norm(spot[b][:, None] - spot[a], axis=2)
         n, frame = len(self._depth), self._sparse_map.kf.frame
         T_wc = np.full((n, 4, 4), np.nan)
         T_wc[frame] = T_ak
@@ -151,6 +154,15 @@ class Jury:
         nearest = apart.argmin(axis=1)
         pairs = [(int(b[row]), int(a[nearest[row]])) for row in np.flatnonzero(apart.min(axis=1) < NEAR_M)]
         return pairs if len(pairs) <= MOST_PAIRS else [pairs[k] for k in np.linspace(0, len(pairs) - 1, MOST_PAIRS).astype(int)]
+
+    def _count_different(self, T_ak: np.ndarray, pairs: list[tuple[int, int]]) -> int:
+        """Count the pairs of views that show different things, until it is decided whether these are too many."""
+        n_different, most = 0, MOST_DIFFERENT * len(pairs)
+        for n_seen, pair in enumerate(pairs):
+            if n_different > most or n_different + len(pairs) - n_seen <= most:
+                break
+            n_different += not self._are_alike(T_ak, *pair)
+        return n_different
 
     def _are_alike(self, T_ak: np.ndarray, i: int, j: int) -> bool:
         T_ia = se3.inverse(T_ak[i])  # j stands in the world of a already

@@ -40,8 +40,36 @@ def test_a_place_looks_different_where_far_fewer_landmarks_are_found_than_elsewh
 
 
 def test_one_place_that_looks_different_is_no_objection_and_two_are() -> None:
-    evidence = [common_place.Comparison(agreement=0.99, n_pairs=20, n_alike=20, n_otherwise=n) for n in (0, 1, 2)]
+    evidence = [common_place.Comparison(agreement=0.99, n_pairs=20, n_different=0, n_otherwise=n) for n in (0, 1, 2)]
     assert [bool(one.objection) for one in evidence] == [False, False, True]
+
+
+def different(monkeypatch: pytest.MonkeyPatch, is_alike: list[bool]) -> tuple[common_place.Comparison, int]:
+    """Compare two parts whose pairs of near views are alike as told; returns also how many pairs were looked at."""
+    asked = []
+
+    def are_alike(_jury, _poses, i: int, j: int) -> bool:
+        asked.append((i, j))
+        return is_alike[i]
+
+    monkeypatch.setattr(common_place.Jury, "_are_alike", are_alike)
+    jury, pairs = common_place.Jury.__new__(common_place.Jury), [(k, k) for k in range(len(is_alike))]
+    found = common_place.Comparison(len(pairs), jury._count_different(np.zeros((0, 4, 4)), pairs))
+    assert asked == pairs[: len(asked)]
+    return found, len(asked)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_pairs_are_looked_at_until_they_say_what_all_of_them_would(monkeypatch: pytest.MonkeyPatch, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    is_alike = (rng.random(rng.integers(0, 30)) < rng.uniform(0.3, 0.7)).tolist()
+    found, _ = different(monkeypatch, is_alike)
+    assert bool(found.objection) == (is_alike.count(False) > common_place.MOST_DIFFERENT * len(is_alike))
+
+
+@pytest.mark.parametrize(("is_alike", "looked_at"), [([False] * 10, 6), ([True] * 10, 5), ([True, False] * 5, 9), ([], 0)])
+def test_no_pair_is_looked_at_once_it_is_decided(monkeypatch: pytest.MonkeyPatch, is_alike: list[bool], looked_at: int) -> None:
+    assert different(monkeypatch, is_alike)[1] == looked_at
 
 
 @pytest.fixture(scope="module")

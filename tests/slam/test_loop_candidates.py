@@ -120,3 +120,12 @@ def test_a_claim_covers_its_span_to_either_side(i, j, is_same):
     claims = Claims([Candidate(10, 30, 0.5)], span=3)
     assert claims.cover(Candidate(i, j, 0.5)) == is_same
     assert len(first_of_each_revisit([Candidate(10, 30, 0.5), Candidate(i, j, 0.5)], span=3)) == 2 - is_same
+
+
+def test_scores_asked_for_again_are_the_same_until_a_key_frame_comes():
+    places = PlaceIndex(words_in([TEN, common(5, 1), common(8, 2)]), np.arange(2))
+    first = places.scores(1)
+    first[:] = 0.0  # the caller's own
+    assert places.scores(1).tolist() == pytest.approx([0.5, 1.0])
+    places.add(2)
+    assert places.scores(1).tolist() == pytest.approx([0.5, 1.0, 0.5])
