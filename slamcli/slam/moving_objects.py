@@ -168,6 +168,11 @@ def hide_features(features: Features, moving: np.ndarray, camera: Camera) -> Fea
     return replace(features, xy=xy, depth=depth)
 
 
+def is_hidden(features: Features) -> np.ndarray:
+    """Say which features (M,) `hide_features` put out of sight."""
+    return features.xy[:, 0] == np.float32(OUT_OF_SIGHT)
+
+
 def hide_coarse(images: CoarseImages, moving: np.ndarray, camera: Camera) -> CoarseImages:
     """Remove what moves from the coarse depth images; `moving` as in `hide_features`."""
     if len(moving) == 0:

@@ -75,6 +75,10 @@ class Tracker:
         """Return the map built so far."""
         return self._sparse_map.snapshot()
 
+    def forget(self, rows: np.ndarray) -> None:
+        """Remove the observations of features `rows` (N,) from the map; the poses stay as they are."""
+        self._sparse_map.remove_observations(rows)
+
     def tracks(self) -> Tracks:
         """Return the pose of every frame processed."""
         return self._poses.tracks()

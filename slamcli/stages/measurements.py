@@ -8,6 +8,7 @@ from slamcli.calibration import self_calibration
 from slamcli.calibration.self_calibration import Sensing
 from slamcli.geometry.camera import Camera
 from slamcli.schema import DepthTimes, Features, FrameTimes, Measured, Timing
+from slamcli.slam import moving_objects
 from slamcli.slam.moving_objects import OUT_OF_SIGHT
 from slamcli.stages.contract import Stored
 
@@ -16,7 +17,7 @@ def corrected(stored: Stored, features: Features, given: Camera, sensing: Sensin
     """Return features of extract, measured under the calibration `given`, as `sensing` says they are; what was hidden stays so."""
     if not sensing.timing.is_of_several:
         return self_calibration.correct(features, given, sensing)
-    measured, is_hidden = stored.load(Measured, "optimize"), features.xy[:, 0] == np.float32(OUT_OF_SIGHT)
+    measured, is_hidden = stored.load(Measured, "optimize"), moving_objects.is_hidden(features)
     return replace(
         features,
         depth_stamp=np.array(stored.load(DepthTimes, "optimize").depth_time),

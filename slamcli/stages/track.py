@@ -42,6 +42,8 @@ def run(inputs: Inputs, out: Path, cfg: Config, tools: Tools) -> Summary:
         moving, background = _find_background(inputs, cfg, tools)
         tracker, stands_still = _track(inputs, moving, background, cfg, tools)
         moving = moving_parts.find(inputs, tracker.tracks(), tracker.map(), tools)
+        shown, _ = moving_parts.still(inputs, moving)
+        tracker.forget(np.flatnonzero(moving_objects.is_hidden(shown)))  # out of sight, they would draw the whole map there
     tracks = tracker.tracks()
     map_ = map_segments.from_first_frames(map_segments.ranked(tracker.map(), tracks), tracks)
     artifacts.save(moving, out)
