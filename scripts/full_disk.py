@@ -15,7 +15,7 @@ import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -30,7 +30,7 @@ def main() -> int:
     options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     options.add_argument("one", type=Path)
     options.add_argument("two", type=Path)
-    options.add_argument("--sizes", type=int, default=50, help="of free room, for each command [50]")
+    options.add_argument("--sizes", type=int, default=50, help="of free room, for each command, beside powers of 2 [50]")
     options.add_argument("--commands", nargs="*", default=[], metavar="WORD", help="only commands that hold one of these words")
     given = options.parse_args()
     wanted = [command for command in COMMANDS if not given.commands or set(given.commands) & set(command)]
@@ -38,17 +38,16 @@ def main() -> int:
     with disk() as folder:
         stand = Stand(folder, given.one, given.two, wanted)
         for command in stand.commands:
-            needed = room_needed(stand, command)
-            refused = 0
-            for free in sorted({needed * k // given.sizes // PAGE * PAGE for k in range(given.sizes)}):
-                n_tried += 1
-                was_refused, faults = tried(stand, command, free)
-                refused += was_refused
+            refused: dict[int, bool] = {}  # by the bytes that were free
+            for free in rooms(refused, given.sizes):
+                refused[free], faults = tried(stand, command, free)
                 for fault in faults:
                     n_faults += 1
                     print(f"{' '.join(command)}, {free} bytes free: {fault}", flush=True)
-            n_refused += refused
-            print(f"{' '.join(command):<60} {needed:>9} bytes needed, refused at {refused} sizes", flush=True)
+            n_tried += len(refused)
+            n_refused += sum(refused.values())
+            told = f"{max(refused):>9} bytes are enough, refused at {sum(refused.values())} of {len(refused)} sizes"
+            print(f"{' '.join(command):<60} {told}", flush=True)
         os.chdir("/")
     print(f"{n_tried} tried, {n_refused} refused, {n_faults} faults")
     return 1 if n_faults else 0
@@ -76,14 +75,14 @@ def used(folder: Path) -> int:
     return (state.f_blocks - state.f_bfree) * state.f_frsize
 
 
-def room_needed(stand: Stand, command: Command) -> int:
-    """Find the least room, of powers of 2, with which a command succeeds."""
-    room = 16 * PAGE
-    while True:
-        refused, _ = tried(stand, command, room)
-        if not refused:
-            return room
-        room *= 2
+def rooms(refused: Mapping[int, bool], sizes: int) -> Iterator[int]:
+    """Double the room until it is enough, then go through so many sizes below that; `refused` tells how the one before ended."""
+    enough = 16 * PAGE
+    yield enough
+    while refused[enough]:
+        enough *= 2
+        yield enough
+    yield from sorted({enough * k // sizes // PAGE * PAGE for k in range(sizes)} - refused.keys())
 
 
 def tried(stand: Stand, command: Command, free: int) -> tuple[bool, list[str]]:

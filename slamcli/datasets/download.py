@@ -83,7 +83,7 @@ def _stream(url: str, part: Path, progress: Progress, label: str) -> Iterator[in
         if have and not _continues(response, have):
             have = 0
         length = response.headers.get("Content-Length", "")
-        total = have + int(length) if length.isdigit() else None
+        total = have + int(length) if re.fullmatch("[0-9]{1,18}", length) else None
         if total is not None and total > MAX_ARCHIVE:
             raise SlamError(f"{url}: {total >> 30} GB is larger than any recording of the set")
         with part.open("ab" if have else "wb") as file:

@@ -32,7 +32,7 @@ def in_order(datasets: Sequence[Dataset]) -> list[int]:
     do_clocks_tell = all(before[1] < after[0] for before, after in zip(spans, spans[1:], strict=False))
 
     def key(i: int) -> tuple:
-        name = [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", datasets[i].name)]
+        name = [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", datasets[i].name)]
         return float(datasets[i].stamp[0]) if do_clocks_tell else 0.0, name, datasets[i].digest()
 
     return sorted(range(len(datasets)), key=key)

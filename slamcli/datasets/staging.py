@@ -29,7 +29,7 @@ def staged(target: Path) -> Iterator[Path]:
 
 def _is_running(pid: str) -> bool:
     """Say whether a process number is in use; what is no number counts as such, so that foreign files stay."""
-    if not pid.isdigit():
+    if not pid.isdecimal():
         return True
     try:
         os.kill(int(pid), 0)

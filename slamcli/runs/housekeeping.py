@@ -144,7 +144,7 @@ def stages_in(archive: Path) -> set[str]:
     try:
         with zipfile.ZipFile(archive) as packed:
             inside = {parts[1] for name in packed.namelist() if len(parts := name.split("/")) > 2}
-    except (OSError, zipfile.BadZipFile, NotImplementedError):
+    except (OSError, zipfile.BadZipFile, NotImplementedError, ValueError):  # the last of names that are no text
         return set()
     return inside & set(NAMES)
 

@@ -1,5 +1,7 @@
 """What only bags have: topics to choose from, transforms, messages out of order, and files that are none."""
 
+import json
+import time
 import zipfile
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +14,7 @@ from layouts import Content
 from recordings import png
 
 from slamcli.datasets import Dataset, open_dataset
+from slamcli.datasets.readers import r3d
 from slamcli.errors import SlamError
 from slamcli.formats import ros_messages
 
@@ -149,6 +152,27 @@ def test_a_zip_bomb_is_refused_before_it_is_unpacked(tmp_path: Path) -> None:
     assert (tmp_path / "scan.r3d").stat().st_size < 1 << 20
     with pytest.raises(SlamError, match=r"scan\.r3d: its metadata are too large"):
         open_dataset(str(tmp_path / "scan.r3d"))
+
+
+def test_members_whose_numbers_are_none_are_no_pictures(tmp_path: Path) -> None:
+    with zipfile.ZipFile(tmp_path / "scan.r3d", "w") as archive:
+        archive.writestr("metadata", b"{}")
+        for name in ("\u00b2", "9" * 5000, "a/7", ""):
+            archive.writestr(f"rgbd/{name}.jpg", b"")
+    with pytest.raises(SlamError, match=r"holds no picture rgbd/N\.jpg"):
+        open_dataset(str(tmp_path / "scan.r3d"))
+
+
+def test_frames_of_a_long_recording_are_listed_in_a_time_that_grows_with_them(content: Content, tmp_path: Path) -> None:
+    n_frames = 20_000
+    with zipfile.ZipFile(tmp_path / "scan.r3d", "w") as archive:
+        archive.writestr("metadata", json.dumps(layouts.record3d_metadata(content)))
+        for i in range(n_frames):
+            archive.writestr(f"rgbd/{i}.jpg", b"")
+            archive.writestr(f"rgbd/{i}.depth", b"")
+    start = time.process_time()
+    assert len(r3d.read(tmp_path / "scan.r3d").depth.images.names) == n_frames
+    assert time.process_time() - start < 5.0
 
 
 def test_metadata_packed_in_a_way_that_is_not_known_are_told(tmp_path: Path) -> None:

@@ -41,6 +41,12 @@ def test_clocks_decide_the_order_where_no_two_overlap_else_names(three: list[Rec
         assert [given[i].name for i in in_order(given)] == ["walk10", "walk2", "attic"]
 
 
+def test_a_figure_that_is_no_number_stands_in_names_as_a_letter(three: list[Recording]) -> None:
+    first, second, _ = three
+    given = [replace(first, name="\u00b2"), replace(second, name="2")]
+    assert [given[i].name for i in in_order(given)] == ["2", "\u00b2"]
+
+
 def test_the_time_line_increases_and_moves_only_what_it_must(three: list[Recording]) -> None:
     later = replace(three[2], stamp=three[2].stamp + 5e5, depth_stamp=three[2].depth_stamp + 5e5)
     joined = JoinedDataset([three[0], three[1], later], ["a", "b", "c"])

@@ -43,6 +43,7 @@ def test_what_a_killed_process_left_is_removed_and_nothing_else(tmp_path: Path) 
     process.wait()
     dead, foreign = tmp_path / f".folder.{process.pid}", tmp_path / ".folder.txt"
     dead.mkdir()
+    (tmp_path / ".folder.\u00b2").mkdir()
     foreign.write_text("x")
     with staged(tmp_path / "folder"):
-        assert not dead.exists() and foreign.exists()
+        assert not dead.exists() and foreign.exists() and (tmp_path / ".folder.\u00b2").exists()

@@ -182,6 +182,15 @@ def test_an_archive_of_more_is_not_overwritten_without_a_word(made, slamcli, her
     assert len((here / "a.zip").read_bytes()) < len(whole)
 
 
+def test_an_archive_whose_names_are_no_text_is_replaced_like_any_file(made, slamcli, here) -> None:
+    with zipfile.ZipFile(here / "a.zip", "w") as packed:
+        packed.writestr("\u00e9/loop/stage.json", "{}")
+    (here / "a.zip").write_bytes((here / "a.zip").read_bytes().replace("\u00e9".encode(), b"\xff\xff"))
+    assert slamcli("archive", "a.zip", "-r", "mine").exit_code == 0
+    with zipfile.ZipFile(here / "a.zip") as packed:
+        assert "mine/run.json" in packed.namelist()
+
+
 def test_nothing_is_deleted_from_a_run_that_was_not_named(made, slamcli, here, monkeypatch) -> None:
     (here / "runs" / "latest").symlink_to("mine")
     result = slamcli("clean", "--keep", "results")

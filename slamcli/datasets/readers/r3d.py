@@ -2,6 +2,7 @@
 
 import importlib
 import json
+import re
 import zipfile
 import zlib
 from collections.abc import Sequence
@@ -17,6 +18,7 @@ from slamcli.errors import BadFrame, SlamError
 
 MAX_MEMBER = 64 << 20  # bytes of one member, packed or unpacked
 MAX_MEMBERS = 1_000_000
+PICTURE = re.compile(r"rgbd/([0-9]{1,18})\.jpg")
 LEAST_CONFIDENCE = 2  # of 0 1 2
 
 
@@ -35,12 +37,12 @@ def read(path: Path) -> Recorded:
     if len(names) > MAX_MEMBERS:
         raise SlamError(f"{path}: {len(names)} members are too many for a recording")
     about = _metadata(archive, path)
-    numbers = sorted(int(Path(n).stem) for n in names if n.startswith("rgbd/") and n.endswith(".jpg") and Path(n).stem.isdigit())
+    numbers = sorted(int(found.group(1)) for name in names if (found := PICTURE.fullmatch(name)))
     if not numbers:
         raise SlamError(f"{path}: holds no picture rgbd/N.jpg")
-    calibration = intrinsics(about, path)
+    calibration, there = intrinsics(about, path), set(names)
     size = _depth_size(about, path)
-    depth = PackedDepth(archive, path, [f"rgbd/{n}.depth" if f"rgbd/{n}.depth" in names else "" for n in numbers], size)
+    depth = PackedDepth(archive, path, [f"rgbd/{n}.depth" if f"rgbd/{n}.depth" in there else "" for n in numbers], size)
     return Recorded(
         reader="r3d",
         root=path,
