@@ -152,8 +152,17 @@ class Run:
         """Change settings, if any are given, and run exactly the stages that need it; the arguments are those of `slamcli.run`."""
         self.directory.restore()
         resolved = toml.resolve(self.config(), config, settings)
-        _bring_up_to_date(self.directory, resolved, None, start=start, until=until, force=force, progress=progress, tell=tell)
+        dataset = self._read_otherwise(resolved)
+        _bring_up_to_date(self.directory, resolved, dataset, start=start, until=until, force=force, progress=progress, tell=tell)
         return self
+
+    def _read_otherwise(self, config: Config) -> "Dataset | None":
+        """Open the recording where `config` has it read otherwise than before: where it cannot be, nothing is changed. None where it has not."""
+        before = self.config()
+        if (config.recording, config.camera) == (before.recording, before.camera):
+            return None
+        dataset = self.directory.dataset(config)
+        return None if self.directory.recordings else dataset
 
     def add(
         self,

@@ -114,6 +114,21 @@ def test_a_stage_alone_and_a_report(room_run: Path, here: Path) -> None:
     assert run.report("page.html").read_text().lower().startswith("<!doctype html>")
 
 
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [({"recording.start": 1e6}, "nothing is left of it"), ({"camera.fx": -1.0}, "fx")],
+)
+def test_a_way_to_read_the_recording_in_which_it_cannot_be_read_changes_nothing(
+    room_run: Path, here: Path, settings: dict, message: str
+) -> None:
+    run = slamcli.open_run(shutil.copytree(room_run, here / "run"))
+    before = run.config()
+    with pytest.raises(slamcli.SlamError, match=message):
+        run.update(settings=settings)
+    assert run.config() == before
+    assert all(state.is_fresh for state in run.status().values())
+
+
 def test_there_is_no_run_to_open(here: Path) -> None:
     with pytest.raises(SlamError, match="not a run directory"):
         slamcli.open_run("nowhere")
