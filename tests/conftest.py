@@ -10,7 +10,9 @@ from click.testing import CliRunner, Result
 from hypothesis import settings
 
 from slamcli.jit import compilation
+from slamcli.runs.places import LATEST
 
+LATEST_BEFORE = pytest.StashKey[tuple[Path, str | None]]()
 ROOM_FRAMES = 40
 ROOM = {"seed": 1, "frames": ROOM_FRAMES, "laps": 0.15, "width": 160, "height": 120}  # settings of the simulated recording `room`
 
@@ -25,9 +27,23 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Compile the kernels once, before several processes begin to test with them."""
+    """Compile the kernels once, before several processes begin to test with them; remember which run was the latest here."""
     if not hasattr(config, "workerinput"):
+        latest = LATEST.absolute()
+        config.stash[LATEST_BEFORE] = latest, os.readlink(latest) if latest.is_symlink() else None
         compilation.ensure()
+
+
+def pytest_unconfigure(config: pytest.Config) -> None:
+    """Let `runs/latest` lead where it led before: tests make runs in folders that are gone afterwards."""
+    latest, target = config.stash.get(LATEST_BEFORE, (None, None))
+    if latest is None or not latest.is_symlink() or os.readlink(latest) == target:
+        return
+    latest.unlink()
+    if target is not None:
+        latest.symlink_to(target)
+    elif not any(latest.parent.iterdir()):
+        latest.parent.rmdir()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
