@@ -94,7 +94,9 @@ def plan(
     if page is None:
         folder = RunDir.find(run)
         grid = folder.load(Grid, "grid2d")
-        height = (folder.record("grid2d") or {})["config"]["grid2d"]["band_high"]
+        made = folder.record("grid2d")
+        assert made is not None, "its grid was loaded"
+        height = made["config"]["grid2d"]["band_high"]
         warn_without_floor(folder)
         warn_of_doubt(folder)
         trajectory, title = camera_path(folder), str(folder.info()["dataset"])
