@@ -1,12 +1,16 @@
 """Depth that was never registered to colour: re-render a recording's depth as another camera sees it, and run that.
 
     python scripts/unregistered.py path/to/rgbd_dataset_freiburg1_xyz
+    python scripts/unregistered.py --rooms 103 104 105 106
 
 Each row is a run of the same colour images: with depth as it is, and with depth of a camera of another focal length that sits aside and
-turned, whose calibration is given in camera.toml, or is kept back. Errors are against the recording's truth, without and with scale.
+turned, whose calibration is given in the camera file, or is kept back. Of simulated rooms, each depth camera's images are rendered, with its
+own noise; those of other recordings are made of the registered ones, and lose some outlines twice. Errors are against the recording's
+truth, without and with scale.
 """
 
 import argparse
+import json
 import tempfile
 from pathlib import Path
 
@@ -16,7 +20,8 @@ import numpy as np
 import slamcli
 from slamcli import inspection
 from slamcli.console import table
-from slamcli.datasets import Dataset, open_dataset
+from slamcli.datasets import Dataset, open_dataset, silent
+from slamcli.datasets.simulate import simulate
 from slamcli.geometry.camera import Camera
 from slamcli.geometry.depth_registration import Registration
 from slamcli.slam.doubt import Finding
@@ -29,12 +34,42 @@ CASES = {"585 px, 25 mm": (585.0, 0.025, (320.0, 240.0)), "385 px, 15 mm": (385.
 def main() -> None:
     """Run every case."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("recording")
-    parser.add_argument("--frames", type=int, default=10**9, help="from the beginning")
+    parser.add_argument("recording", nargs="?")
+    parser.add_argument("--rooms", type=int, nargs="+", metavar="SEED", default=[], help="simulated rooms instead of a recording")
+    parser.add_argument("--frames", type=int, help="from the beginning; of a room [360]")
     parser.add_argument("--kept-back", action="store_true", help="also without the depth camera's calibration")
     arguments = parser.parse_args()
+    if arguments.recording:
+        of_recording(arguments)
+    for seed in arguments.rooms:
+        of_room(seed, arguments)
+
+
+def of_room(seed: int, arguments: argparse.Namespace) -> None:
+    """Render a room with registered depth and with each depth camera, run all, print the table."""
+    rows = [["depth", "APE [m]", "with scale", "scale", "frames"]]
+    with tempfile.TemporaryDirectory() as folder:
+        place = Path(folder)
+
+        def rendered(name: str, **beside: float) -> Path:
+            return simulate(place / name, progress=silent, seed=seed, frames=arguments.frames or 360, **beside)
+
+        rows.append([f"room {seed}, registered", *figures(rendered("registered"), place / "runs/registered")])
+        for name, (focal, aside, _) in CASES.items():
+            recording = rendered(name, depth_focal=focal, depth_aside=aside, depth_turn=TURN_DEG)
+            rows.append([f"{name}, given", *figures(recording, place / "runs" / f"{name}, given")])
+            if arguments.kept_back:
+                calibration = json.loads((recording / "camera.json").read_text())
+                del calibration["depth"]
+                (recording / "camera.json").write_text(json.dumps(calibration))
+                rows.append([f"{name}, kept back", *figures(recording, place / "runs" / f"{name}, kept back")])
+    print(table(rows), flush=True)
+
+
+def of_recording(arguments: argparse.Namespace) -> None:
+    """Re-render a recording's depth for each depth camera, run all, print the table."""
     dataset = open_dataset(arguments.recording)
-    n = min(arguments.frames, len(dataset))
+    n = min(arguments.frames or len(dataset), len(dataset))
     rows = [["depth", "APE [m]", "with scale", "scale", "frames"]]
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder)

@@ -36,6 +36,9 @@ from slamcli.cli.common import Target
 )
 @click.option("--depth-min", default=0.4, show_default=True, help="Nearest reading of the noisy camera [m].")
 @click.option("--depth-max", default=5.0, show_default=True, help="Farthest reading of the noisy camera [m].")
+@click.option("--depth-focal", type=float, help="Focal length of a depth camera of its own [px]. [default: depth is registered]")
+@click.option("--depth-aside", default=0.025, show_default=True, help="Where it sits, to the right of the colour camera [m].")
+@click.option("--depth-turn", default=0.5, show_default=True, help="By how much it is turned [degrees].")
 @click.option("--holes", default=0.0, show_default=True, help="Share of all surface that gives no depth, as glass does.")
 @click.option("--textured", default=1.0, show_default=True, help="Share of objects and walls with a picture; 0 = plain colours, shaded.")
 @click.option("--dark", is_flag=True, help="No lamp: the colour images hold noise only, the depth camera has its own light.")
@@ -79,6 +82,7 @@ def simulate(
       slamcli simulate crowd --people 2 --activity beside --activity cross
       slamcli simulate lab --speed 0.15 --turn-rate 0.15 --laps 1 --field-of-view 57 --depth-min 1.2 --depth-max 3.5
       slamcli simulate offices --building --recordings 5
+      slamcli simulate unregistered --depth-focal 585
       slamcli simulate hand --trajectory fr1_room.txt --stamps fr1_room_stamps.txt
     """
     from slamcli import console

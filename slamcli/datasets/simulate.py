@@ -20,6 +20,7 @@ from slamcli.datasets.simulated.scene import Patch, Scene, with_textured_share
 from slamcli.datasets.staging import staged
 from slamcli.errors import SlamError
 from slamcli.formats.trajectory import read_tum, write_tum
+from slamcli.geometry import se3
 from slamcli.geometry.algebra import product
 from slamcli.geometry.camera import Camera
 from slamcli.parallel import least_instructions_in_opencv, ordered_map
@@ -35,6 +36,7 @@ MOST_PEOPLE = 20
 SIDES = (4.0, 50.0)  # [m] of a room: the furniture needs so much, the textures fill the memory
 MOST_RECORDINGS = 100
 OVERLAP = 0.4  # of a recording's part of the way that the next one drives too
+DEPTH_AXIS = np.array([0.5, 0.7, 0.5])  # about which a depth camera of its own is turned, nearly of length 1
 LIGHTS = 1.0, 0.75, 1.2, 0.85, 1.1  # brightness of one recording after the other
 AROUND_TRAJECTORY = 1.6  # [m] from a given trajectory to the walls
 PNG_SETTINGS = [cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_SUB]
@@ -61,6 +63,9 @@ class Simulation:
     noise: str = "kinect"  # or "none": exact images
     depth_min: float = 0.4  # of the noisy camera
     depth_max: float = 5.0
+    depth_focal: float | None = None  # [px] of a depth camera of its own; None = depth is registered to colour
+    depth_aside: float = 0.025  # where it sits, to the right of the colour camera,
+    depth_turn: float = 0.5  # and by how much it is turned, about DEPTH_AXIS
     holes: float = 0.0  # share of all surface that gives no depth, as glass and black or shiny things do
     textured: float = 1.0  # share of objects and walls with a picture on them
     dark: bool = False  # nothing but noise in the colour images; depth brings its own light
@@ -87,6 +92,14 @@ class Simulation:
         """Return the camera, without distortion."""
         focal = self.width / 2 / np.tan(np.radians(self.field_of_view) / 2)
         return Camera(self.width, self.height, focal, focal, (self.width - 1) / 2, (self.height - 1) / 2, depth_scale=DEPTH_SCALE)
+
+    def depth_camera(self) -> tuple[Camera, np.ndarray] | None:
+        """Return the depth camera and T_cd (4, 4), depth camera to colour camera; None where depth is registered to colour."""
+        if self.depth_focal is None:
+            return None
+        T_cd = se3.exp(np.concatenate([np.zeros(3), np.radians(self.depth_turn) * DEPTH_AXIS]))
+        T_cd[0, 3] = self.depth_aside
+        return replace(self.camera(), fx=self.depth_focal, fy=self.depth_focal), T_cd
 
 
 def simulate(out: Path, *, progress: Progress, workers: int = 2, **settings: Any) -> Path:
@@ -219,6 +232,7 @@ def _check(what: Simulation) -> None:
         "frames": (1, 1_000_000), "laps": (0.01, 1000), "speed": (0.001, 100), "turn_rate": (0.001, 100), "rate": (0.1, 1000), "rest": (0, 3600),
         "width": (32, 4096), "height": (32, 4096), "field_of_view": (20, 120), "camera_height": (0.1, 2.4), "pitch": (-80, 80),
         "start": (0, 1), "light": (0.05, 4), "take": (0, 1_000_000), "twin": (0, 1_000_000),
+        "depth_aside": (-0.2, 0.2), "depth_turn": (-10, 10), "depth_focal": (32, 4096),
         "rooms": (1, building.MOST_ROOMS), "gone_from": (0, 1), "depth_min": (0, 10), "depth_max": (0.1, 13), "textured": (0, 1), "holes": (0, 1), "seed": (0, 2**31), "people": (0, MOST_PEOPLE),
     }  # fmt: skip
     for name, (least, most) in bounds.items():
@@ -246,7 +260,7 @@ def _write_lists(folder: Path, what: Simulation, scene: Scene, motion: Motion, f
     stamp, first = np.unique(np.concatenate([motion.colour_stamp, motion.depth_stamp]), return_index=True)
     poses = np.concatenate([motion.colour_T_lc, motion.depth_T_lc])[first]
     write_tum(folder / "groundtruth.txt", Trajectory(stamp=stamp, T_wc=poses))
-    (folder / "camera.json").write_text(json.dumps(what.camera().to_dict(), indent=1) + "\n")
+    (folder / "camera.json").write_text(json.dumps(_calibration(what), indent=1) + "\n")
     n_with = int(what.gone_from * len(motion.colour_stamp))
     gone_from = float(motion.colour_stamp[n_with]) if n_with < len(motion.colour_stamp) else None
     about = {
@@ -265,6 +279,16 @@ def _write_lists(folder: Path, what: Simulation, scene: Scene, motion: Motion, f
     (folder / "scene.json").write_text(json.dumps(about, indent=1) + "\n")
 
 
+def _calibration(what: Simulation) -> dict[str, Any]:
+    """Return what the camera file tells: the colour camera and, where it is another, the depth camera and where it sits."""
+    beside = what.depth_camera()
+    if beside is None:
+        return what.camera().to_dict()
+    camera, T_cd = beside
+    depth = {key: getattr(camera, key) for key in ("fx", "fy", "cx", "cy")} | {"T_cd": T_cd.tolist()}
+    return {**what.camera().to_dict(), "depth": depth}
+
+
 def _write_images(
     folder: Path, what: Simulation, scene: Scene, motion: Motion, figures: list[Figure], progress: Progress, workers: int
 ) -> np.ndarray:
@@ -278,9 +302,12 @@ def _write_images(
     crowd = Crowd(figures, what.camera(), texel=texel, seed=what.seed) if figures else None
     shares = np.zeros((len(motion.colour_stamp), len(figures)))
     n = len(motion.colour_stamp)
-    has_one_clock = np.array_equal(motion.colour_stamp, motion.depth_stamp)
+    depth_camera, T_cd = what.depth_camera() or (what.camera(), np.eye(4))
+    depth_renderer, depth_crowd = renderer.through(depth_camera), crowd and crowd.through(depth_camera)
+    depth_T_lc = product(motion.depth_T_lc, T_cd)
+    is_one_view = what.depth_focal is None and np.array_equal(motion.colour_stamp, motion.depth_stamp)
     sensor = replace(SensorNoise(), near=what.depth_min, far=what.depth_max)
-    normal_noise, camera = noise.NormalNoise((what.height, what.width), what.seed), what.camera()
+    normal_noise = noise.NormalNoise((what.height, what.width), what.seed)
 
     def one(i: int) -> None:
         cv2.ipp.setUseIPP(False)  # each thread has a switch of its own, beside `least_instructions_in_opencv`
@@ -292,18 +319,18 @@ def _write_images(
             rgb, depth, cosine = drawn.rgb, drawn.depth, drawn.cosine
             shares[i] = np.bincount(drawn.owner.ravel(), minlength=len(figures) + 1)[1:] / depth.size
             _write_png(folder / "moving" / f"{motion.colour_stamp[i]:.6f}.png", drawn.owner)
-        if not has_one_clock:
-            depth, cosine = renderer.depth(motion.depth_T_lc[i], with_movable=shown)
-            if crowd is not None:
-                drawn = crowd.draw(motion.depth_T_lc[i], motion.depth_stamp[i], rgb, depth, cosine)
+        if not is_one_view:
+            depth, cosine = depth_renderer.depth(depth_T_lc[i], with_movable=shown)
+            if depth_crowd is not None:
+                drawn = depth_crowd.draw(depth_T_lc[i], motion.depth_stamp[i], rgb, depth, cosine)
                 depth, cosine = drawn.depth, drawn.cosine
         if what.dark:
             rgb = np.zeros_like(rgb)
         if what.light != 1.0:
             rgb = rgb * np.float32(what.light)
-        lost = noise.without_reading(depth, motion.depth_T_lc[i], camera, share=what.holes, seed=what.seed) if what.holes else None
+        lost = noise.without_reading(depth, depth_T_lc[i], depth_camera, share=what.holes, seed=what.seed) if what.holes else None
         if what.noise == "kinect":
-            depth = noise.depth_noise(depth, cosine, camera.fx, sensor, normal_noise, rng)
+            depth = noise.depth_noise(depth, cosine, depth_camera.fx, sensor, normal_noise, rng)
             picture = noise.colour_noise(rgb, sensor, normal_noise, rng)
         else:
             picture = np.clip(rgb + 0.5, 0, 255).astype(np.uint8)

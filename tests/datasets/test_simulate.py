@@ -108,6 +108,22 @@ def test_noisy_depth_is_near_the_truth_and_has_holes(exact: Path, tmp_path: Path
         assert 0.2 < np.median(off) < 1.5
 
 
+@pytest.mark.parametrize(("focal", "covered"), [(210.0, 0.99), (290.0, 0.82)])
+def test_depth_of_a_camera_of_its_own_says_the_same_once_it_is_registered(tmp_path: Path, focal: float, covered: float) -> None:
+    what = {"progress": silent, "seed": 2, "noise": "none", "frames": 1, "width": 320, "height": 240}
+    plain, own = (
+        open_dataset(str(simulate(tmp_path / name, **beside, **what))) for name, beside in (("plain", {}), ("own", {"depth_focal": focal}))
+    )
+    np.testing.assert_array_equal(own.grey(0), plain.grey(0))
+    z, registered = plain.depth(0), own.depth(0)
+    raw = cv2.imread(str(tmp_path / "own" / own.depth_name[0]), cv2.IMREAD_UNCHANGED) / 5000.0
+    assert np.median(np.abs(raw - z)) > 0.02  # as it lies it is of another view
+    has = np.isfinite(registered)
+    assert has.mean() == pytest.approx(covered, abs=0.02)
+    off = np.abs(registered - z)[has]
+    assert np.median(off) < 0.0002 and (off > 0.05).mean() < 0.01  # the first is the step of a stored reading, the second at outlines
+
+
 def test_same_seed_same_bytes_another_seed_another_room(exact: Path, tmp_path: Path) -> None:
     again = simulate(tmp_path / "again", progress=silent, workers=1, seed=2, noise="none", movable=True, **SMALL)
     names = sorted(str(path.relative_to(exact)) for path in exact.rglob("*") if path.is_file())
@@ -148,6 +164,7 @@ def test_following_a_trajectory_keeps_its_motion_and_both_clocks(tmp_path: Path)
         ({"depth_min": 4.0, "depth_max": 3.0}, "depth_min"),
         ({"speed": float("nan")}, "speed"),
         ({"start": 1.5}, "start"),
+        ({"depth_focal": 5.0}, "depth_focal"),
         ({"light": 0.0}, "light"),
         ({"building": True, "people": 2}, "building: takes no people"),
     ],
@@ -216,6 +233,8 @@ def test_defaults_of_the_command_line_are_the_simulation_s() -> None:
         "noise",
         "depth_min",
         "depth_max",
+        "depth_aside",
+        "depth_turn",
         "textured",
         "room",
     ):

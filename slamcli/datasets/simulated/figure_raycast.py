@@ -1,5 +1,6 @@
 """Draw figures over a rendered room: every part is a ray-cast ellipsoid or box, and the nearer of it and the room is seen."""
 
+from copy import copy
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -84,6 +85,12 @@ class Crowd:
             level.append(len(size))
         level_at, sizes, starts = (np.array(values, dtype=np.int64) for values in (level, size, start))
         self._pictures = _Pictures(level_at, sizes, starts, np.concatenate(pixels), texel)
+
+    def through(self, camera: Camera) -> "Crowd":
+        """Return the same figures for another camera."""
+        other = copy(self)
+        other._camera = camera
+        return other
 
     def draw(self, T_lc: np.ndarray, stamp: float, rgb: np.ndarray, depth: np.ndarray, cosine: np.ndarray) -> Drawn:
         """Draw what a camera at T_lc sees at `stamp` over the room's colour, depth and cosine of incidence."""

@@ -3,6 +3,7 @@
 Pixels on the border between two patches are cast four more times, so that edges are smooth.
 """
 
+from copy import copy
 from typing import Any
 
 import numpy as np
@@ -24,7 +25,7 @@ class Renderer:
 
     def __init__(self, patches: list[Patch], scene: Scene, camera: Camera, *, texel: float) -> None:
         """Bake light and textures; `texel` is the side of the finest texture pixel [m]."""
-        self._camera = camera
+        self._look_through(camera)
         triangles, self._patch_of = _triangles(patches)
         self._scene = _raycasting_scene(triangles)
         light = bake_light(patches, scene, self._scene, LIGHT_TEXEL * max(1.0, texel / 0.006))
@@ -34,7 +35,15 @@ class Renderer:
         if len(fixed) < len(patches):
             triangles, index = _triangles([patches[k] for k in fixed])
             self._fixed_scene, self._fixed_patch_of = _raycasting_scene(triangles), np.array(fixed, dtype=np.int32)[index]
-        self._rays = camera.rays.astype(np.float64).reshape(-1, 2)
+
+    def through(self, camera: Camera) -> "Renderer":
+        """Return a renderer of the same scene for another camera; light and textures are shared."""
+        other = copy(self)
+        other._look_through(camera)
+        return other
+
+    def _look_through(self, camera: Camera) -> None:
+        self._camera, self._rays = camera, camera.rays.astype(np.float64).reshape(-1, 2)
 
     def render(self, T_lc: np.ndarray, *, with_movable: bool = True) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return colour (H, W, 3) float32, depth (H, W) float32 [m] and the cosine of incidence (H, W) float32."""
