@@ -18,7 +18,7 @@ from slamcli.schema import Features, Words
 from slamcli.slam.background_step import Judgement, StepFinder, is_poor, swerve
 
 SPACING = 0.35  # [s] from anchor to anchor: a walker has gone 0.3 m, ten times the noise of depth at 3 m
-SWERVE_COST, SWERVE_MOST = 0.1, 3.0  # share of the surface that a swerve is worth, and how many of them at most
+SWERVE_COST, SWERVE_MOST = 0.1, 6.0  # share of the surface that a swerve is worth, and how many of them at most
 
 
 class BackgroundMotion:
@@ -76,7 +76,7 @@ class BackgroundMotion:
         reference = first if share < 0.5 else last
         expected = product(se3.inverse(se3.interpolate(T_wc[first], T_wc[last], share)), T_wc[reference])
         judged = self._steps.near(reference, i, expected)
-        best = max(judged, key=lambda one: one.score - SWERVE_COST * min(swerve(one.T, expected), SWERVE_MOST))
+        best = max(judged, key=lambda one: one.score - _cost(one.T, expected))
         T_wc[i] = product(T_wc[reference], se3.inverse(best.T))
 
 
@@ -97,14 +97,20 @@ def _steadiest(steps: list[list[Judgement]], scale: list[float]) -> list[np.ndar
     """
     total, came_from = [np.array([one.score for one in candidates]) for candidates in steps], list[np.ndarray]()
     for k in range(1, len(steps)):
-        cost = np.array([[min(swerve(one.T, _scaled(other.T, scale[k])), SWERVE_MOST) for other in steps[k - 1]] for one in steps[k]])
-        through = total[k - 1][None, :] - SWERVE_COST * cost
+        cost = np.array([[_cost(one.T, _scaled(other.T, scale[k])) for other in steps[k - 1]] for one in steps[k]])
+        through = total[k - 1][None, :] - cost
         came_from.append(through.argmax(axis=1))
         total[k] = total[k] + through.max(axis=1)
     chosen = [int(total[-1].argmax())] if steps else []
     for origin in reversed(came_from):
         chosen.append(int(origin[chosen[-1]]))
     return [candidates[number].T for candidates, number in zip(steps, reversed(chosen), strict=True)]
+
+
+def _cost(T: np.ndarray, expected: np.ndarray) -> float:
+    """Weigh a swerve: with its square up to 1, beyond with its root, so that a turn that ends by and by costs no more than one cut short."""
+    squared = swerve(T, expected)
+    return SWERVE_COST * min(squared if squared < 1.0 else 2.0 * np.sqrt(squared) - 1.0, SWERVE_MOST)
 
 
 def anchor_frames(stamp: np.ndarray, shows_depth: np.ndarray) -> list[int]:

@@ -33,15 +33,18 @@ def shape(camera: Camera) -> tuple[int, int]:
     return rows // STEP, columns // STEP
 
 
-def seen_from(views: Views, frame: int, others: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Look from other views (N,) at what one shows: depth (v, u) [m], 0 = unknown, and what each says of it, (N, v, u), as the kernel `compare` has it."""
+def seen_from(views: Views, frame: int, others: np.ndarray, *, shown: CoarseImages | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Look from other views (N,) at what one shows: depth (v, u) [m], 0 = unknown, and what each says of it, (N, v, u), as the kernel `compare` has it.
+
+    shown : what the others show, if not all of their depth
+    """
     small, row_at = icp.coarse_camera(views.camera)
     place = np.where(row_at < small.width * small.height, row_at, -1).astype(np.int32)
     raw = np.append(views.depth[frame].ravel(), np.uint16(0))
     z = raw[place].astype(np.float32) * np.float32(icp.UNIT)  # -1 takes the 0 at the end
     T = np.ascontiguousarray(product(se3.inverse(views.T_wc[others]), views.T_wc[frame]))
     seen = np.zeros((len(others), *shape(views.camera)), dtype=np.uint8)
-    looked_from = kernels.Others(views.depth.of(others), place, T, icp.UNIT)
+    looked_from = kernels.Others((views.depth if shown is None else shown).of(others), place, T, icp.UNIT)
     kernels.compare(z, kernels.smooth_places(z, SMOOTH), STEP, looked_from, _pinhole(views.camera), TOLERANCE, seen)
     rows, columns = seen.shape[1:]
     return np.ascontiguousarray(z[STEP // 2 :: STEP, STEP // 2 :: STEP][:rows, :columns]), seen

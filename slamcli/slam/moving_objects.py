@@ -31,6 +31,7 @@ MIN_STILL = 2  # views long before or after that find a place again where it is 
 GROUP_JUMP = 0.1  # of the depth, between neighbouring places of one group
 SPREAD_JUMP = 0.015  # of the depth, between neighbouring places that it spreads over: less than the floor's slant
 SPREAD_MOST = 30  # places that it spreads
+SPREAD_ROUNDS = 2  # each finds again less of what moves
 OUTLINE, ENCLOSED = 3, 4  # of its eight neighbours move: so does a place without depth, beside the background and elsewhere
 MOST = 0.6  # of the surface seen [m^2]: when more seems to move, it is the pose that is wrong
 MAP_MARGIN = 2  # places around what moves that maps leave out: other views show what stands there
@@ -50,7 +51,7 @@ class Rule:
     weight_still: float  # such views a place needs for each one that finds it again
     min_group: int  # connected places: less is noise along edges
     followed: float  # [s] before it goes, and after it came, over which what moves is recognized where it stands
-    spreads: bool = False  # over what is connected with it and no view some time apart confirms
+    spreads: bool = False  # over what is connected with it and nothing still confirms some time apart
 
 
 # Whether anything moves is asked of every recording, and poses that err are not to answer it.
@@ -86,12 +87,29 @@ def find(views: Views, progress: Callable[[range], Iterable[int]] = iter, *, rul
             sightings.note(frame, evidence, *_find_in(evidence, rule))
     moving = standing_objects.follow(views, sightings, most=rule.followed)
     for frame, found in enumerate(moving):
-        z = sightings.z(frame)
-        if _is_most(found, z):
+        if _is_most(found, sightings.z(frame)):
             found[:] = sightings.is_moving[frame]
-        if rule.spreads and found.any():
-            found |= kernels.grow(found, sightings.is_unconfirmed[frame], z, SPREAD_JUMP, SPREAD_MOST)
-        found |= _outline(found, z)
+    if rule.spreads and moving.any():
+        moving = spread(views, moving, rule.after)
+    for frame, found in enumerate(moving):
+        found |= _outline(found, sightings.z(frame))
+    return moving
+
+
+def spread(views: Views, moving: np.ndarray, after: tuple[float, ...]) -> np.ndarray:
+    """Add to what moves, (F, v, u) bool, the surface that hangs together with it and that nothing still in a view some time apart shows again.
+
+    after : as of `Rule`
+    Legs near by leave the picture before any view looks through them, and other legs come to where they were.
+    """
+    for _ in range(SPREAD_ROUNDS):
+        still, found = hide_coarse(views.depth, moving, views.camera), moving.copy()
+        for frame in np.flatnonzero(moving.any(axis=(1, 2))).tolist():
+            evidence = weigh(views, frame, after, shown=still)
+            if evidence is not None:
+                is_open = (evidence.depth > 0) & (evidence.n_still == 0)
+                found[frame] = kernels.grow(moving[frame], is_open, evidence.depth, SPREAD_JUMP, SPREAD_MOST)
+        moving = found
     return moving
 
 
@@ -115,12 +133,12 @@ def _outline(moving: np.ndarray, z: np.ndarray) -> np.ndarray:
     return (z == 0) & (n_moving >= np.where(n_still > 0, OUTLINE, ENCLOSED))
 
 
-def weigh(views: Views, frame: int, after: tuple[float, ...]) -> PlaceEvidence | None:
-    """Compare a view with those `after` [s] before and after it; None where none can be compared."""
+def weigh(views: Views, frame: int, after: tuple[float, ...], *, shown: CoarseImages | None = None) -> PlaceEvidence | None:
+    """Compare a view with those `after` [s] before and after it, of which `shown` is to be seen; None where none can be compared."""
     others = _others(views, frame, after) if views.depth.size else np.zeros(0, dtype=np.int64)
     if len(others) == 0 or not np.isfinite(views.T_wc[frame, 0, 0]):
         return None
-    middle, seen = seen_from(views, frame, others)
+    middle, seen = seen_from(views, frame, others, shown=shown)
     apart, is_again = views.stamp[others] - views.stamp[frame], seen == kernels.AGAIN
     when = np.where(is_again, apart.astype(np.float32)[:, None, None], np.float32(0.0))
     return PlaceEvidence(

@@ -44,19 +44,17 @@ class MovingSightings:
     until: np.ndarray  # float16 [s]
     is_sure: np.ndarray  # bool, surely moving
     is_moving: np.ndarray  # bool, with what moves along
-    is_unconfirmed: np.ndarray  # bool, a surface that no view some time apart finds again
 
     @classmethod
     def none(cls, n: int, places: tuple[int, int]) -> "MovingSightings":
         """Begin with nothing seen in any of n views."""
         half, flag = ((n, *places), np.float16), ((n, *places), np.bool_)
-        return cls(*(np.zeros(*kind) for kind in (half, half, half, flag, flag, flag)))
+        return cls(*(np.zeros(*kind) for kind in (half, half, half, flag, flag)))
 
     def note(self, frame: int, evidence: PlaceEvidence, is_sure: np.ndarray, is_moving: np.ndarray) -> None:
         """Keep what is known of a view."""
         self.depth[frame], self.since[frame], self.until[frame] = evidence.depth, evidence.since, evidence.until
         self.is_sure[frame], self.is_moving[frame] = is_sure, is_moving
-        self.is_unconfirmed[frame] = (evidence.depth > 0) & (evidence.n_still == 0)
 
     def z(self, frame: int) -> np.ndarray:
         """Return the depth (v, u) float32 [m] of a view."""
