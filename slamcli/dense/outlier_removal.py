@@ -32,9 +32,11 @@ def not_stray(xyz: np.ndarray, key: np.ndarray, *, side: float, neighbours: int,
     cells.reserve(len(first))
     _index_cells(cell_key[first], cells.index)
     distance = np.empty(len(xyz), dtype=np.float32)
-    around, nearest = np.empty((27, 5), dtype=np.int64), np.empty(neighbours, dtype=np.float32)
-    reach = np.float32(CELL_VOXELS * side)
-    _mean_distances(xyz, np.append(first, len(xyz)), cells.index, reach, around, nearest, distance)
+    nearest = np.empty(neighbours, dtype=np.float32)
+    begin = np.append(first, len(xyz))
+    most = 27 * int(np.diff(begin).max())
+    candidates, squares = np.empty((3, most), dtype=np.float32), np.empty(most, dtype=np.float32)
+    _mean_distances(xyz, begin, cells.index, np.float32(CELL_VOXELS * side), candidates, squares, nearest, distance)
     return distance <= distance.mean(dtype=np.float64) + max_deviation * distance.std(dtype=np.float64)
 
 
@@ -45,55 +47,49 @@ def _index_cells(key: i8[::1], index: Index):
 
 
 @kernel
-def _mean_distances(xyz: f4[:, ::1], first: i8[::1], index: Index, reach: f4, around: i8[:, ::1], nearest: f4[::1], distance: f4[::1]):
+def _mean_distances(
+    xyz: f4[:, ::1], first: i8[::1], index: Index, reach: f4, candidates: f4[:, ::1], squares: f4[::1], nearest: f4[::1], distance: f4[::1]
+):
     """Fill each point's mean distance to its nearest neighbours, those beyond `reach`, a cell's side, counted at `reach`.
 
-    around (27, 5), nearest (neighbours,) : room to work in; the first holds the point rows and the place of each cell round about
+    candidates (3, M), squares (M,), nearest (neighbours,) : room to work in, M as many as the points of 27 cells can be
     """
-    neighbours, row_key = len(nearest), index.row_key
-    half = 1 << (20 - CELL_BITS)
-    zero = np.float32(0.0)
+    neighbours = len(nearest)
     for cell in range(len(first) - 1):
-        cx, cy, cz = gather(row_key[cell]), gather(row_key[cell] >> 1), gather(row_key[cell] >> 2)
-        n_cells = 0
-        for k in range(27):
-            # The cell itself comes first: with its points known, most others are too far to matter.
-            k = (k + 13) % 27
-            x, y, z = k % 3 - 1, k // 3 % 3 - 1, k // 9 - 1
-            row = find_row(index, spread(cx + x) | spread(cy + y) << 1 | spread(cz + z) << 2)
-            if row >= 0:
-                around[n_cells, 0], around[n_cells, 1] = first[row], first[row + 1]
-                around[n_cells, 2], around[n_cells, 3], around[n_cells, 4] = x, y, z
-                n_cells += 1
-        left, below, front = np.float32(reach * (cx - half)), np.float32(reach * (cy - half)), np.float32(reach * (cz - half))
+        n = _gather_around(xyz, first, index, cell, candidates)
+        xs, ys, zs = candidates[0, :n], candidates[1, :n], candidates[2, :n]
         for i in range(first[cell], first[cell + 1]):
-            px, py, pz = xyz[i, 0], xyz[i, 1], xyz[i, 2]
-            for k in range(neighbours):
-                nearest[k] = reach * reach
-            for k in range(n_cells):
-                gx = _gap(px - left, around[k, 2], reach)
-                gy = _gap(py - below, around[k, 3], reach)
-                gz = _gap(pz - front, around[k, 4], reach)
-                if gx * gx + gy * gy + gz * gz >= nearest[neighbours - 1]:
-                    continue
-                for j in range(around[k, 0], around[k, 1]):
-                    dx, dy, dz = xyz[j, 0] - px, xyz[j, 1] - py, xyz[j, 2] - pz
-                    square = dx * dx + dy * dy + dz * dz
-                    if square < nearest[neighbours - 1] and j != i:
-                        at = neighbours - 1
-                        while at > 0 and nearest[at - 1] > square:
-                            nearest[at] = nearest[at - 1]
-                            at -= 1
-                        nearest[at] = square
-            total = zero
+            # A loop of its own, as the compiler turns it into vector instructions.
+            for j in range(n):
+                dx, dy, dz = xs[j] - xyz[i, 0], ys[j] - xyz[i, 1], zs[j] - xyz[i, 2]
+                squares[j] = dx * dx + dy * dy + dz * dz
+            squares[i - first[cell]] = np.inf  # the point itself
+            nearest[:] = reach * reach
+            farthest = reach * reach
+            for j in range(n):
+                square = squares[j]
+                if square < farthest:
+                    # Passed down the whole list, so that there is no branch to mispredict.
+                    for k in range(neighbours):
+                        nearest[k], square = min(nearest[k], square), max(nearest[k], square)
+                    farthest = nearest[neighbours - 1]
+            total = np.float32(0.0)
             for k in range(neighbours):
                 total += np.sqrt(nearest[k])
             distance[i] = total / np.float32(neighbours)
 
 
 @kernel
-def _gap(x, side, reach):
-    """Return the distance along one axis from x, measured from the cell's lower face, to the cell beside it on that side."""
-    if side < 0:
-        return x
-    return reach - x if side > 0 else np.float32(0.0)
+def _gather_around(xyz, first, index, cell, out):
+    """Copy the points of a cell and of the 26 round about into out (3, M); returns how many."""
+    key = index.row_key[cell]
+    cx, cy, cz = gather(key), gather(key >> 1), gather(key >> 2)
+    n = 0
+    for k in range(27):
+        k = (k + 13) % 27  # the cell itself first: with its points known, most others are too far to matter
+        row = find_row(index, spread(cx + k % 3 - 1) | spread(cy + k // 3 % 3 - 1) << 1 | spread(cz + k // 9 - 1) << 2)
+        if row >= 0:
+            for i in range(first[row], first[row + 1]):
+                out[0, n], out[1, n], out[2, n] = xyz[i, 0], xyz[i, 1], xyz[i, 2]
+                n += 1
+    return n

@@ -14,12 +14,10 @@ from slamcli import mapped_memory
 from slamcli.dense import outlier_removal
 from slamcli.depth.oriented_points import Surface
 from slamcli.geometry import se3, voxel
-from slamcli.geometry.voxel import Index, find_or_add, spread
+from slamcli.geometry.voxel import Index, find_or_add, gather, spread
 from slamcli.jit.kernel import kernel
 
 HALF_EXTENT = outlier_removal.HALF_EXTENT
-# Columns of the sums: of the weights; weighted, of the offset from the voxel's centre [voxels], the normal and the colour.
-WEIGHT, OFFSET, NORMAL, RGB = slice(0, 1), slice(1, 4), slice(4, 7), slice(7, 10)
 
 
 @dataclass(frozen=True)
@@ -73,26 +71,16 @@ class VoxelCloud:
         key = self._rows.key[row]
         order = np.argsort(key)
         row, key = row[order], key[order]
-        sums = self._rows.columns["sums"]
+        xyz, normal, rgb = (mapped_memory.empty((len(row), 3), of) for of in (np.float32, np.float32, np.uint8))
+        for rows in mapped_memory.blocks(xyz):
+            _average(self._rows.columns["sums"], row[rows], key[rows], self.side, xyz[rows], normal[rows], rgb[rows])
+            mapped_memory.release_beyond(mapped_memory.MOST_RESIDENT)
+        keep = outlier_removal.not_stray(xyz, key, side=self.side, neighbours=neighbours, max_deviation=max_deviation)
+        return Cloud(*(_kept(of, np.flatnonzero(keep)) for of in (xyz, rgb, normal)))
 
-        def mean(rows: slice, columns: slice) -> np.ndarray:
-            return sums[row[rows], columns] / sums[row[rows], WEIGHT]
 
-        def xyz(rows: slice) -> np.ndarray:
-            return (voxel.unmorton(key[rows]) - HALF_EXTENT + 0.5 + mean(rows, OFFSET)) * self.side
-
-        def normal(rows: slice) -> np.ndarray:
-            sum_ = mean(rows, NORMAL)
-            length = np.linalg.norm(sum_, axis=1, keepdims=True)
-            return sum_ / np.where(length > 0, length, 1.0)
-
-        def rgb(rows: slice) -> np.ndarray:
-            return np.clip(np.rint(mean(rows, RGB)), 0, 255)
-
-        points = _vectors(xyz, len(row))
-        keep = outlier_removal.not_stray(points, key, side=self.side, neighbours=neighbours, max_deviation=max_deviation)
-        row, key = row[keep], key[keep]
-        return Cloud(_vectors(xyz, len(row)), mapped_memory.by_blocks(rgb, len(row), (3,), np.uint8), _vectors(normal, len(row)))
+def _kept(of: np.ndarray, row: np.ndarray) -> np.ndarray:
+    return mapped_memory.by_blocks(lambda rows: of[row[rows]], len(row), (3,), of.dtype)
 
 
 def _vectors(values: Callable[[slice], np.ndarray], n: int) -> np.ndarray:
@@ -112,7 +100,7 @@ class _Points(NamedTuple):
 class _Voxels(NamedTuple):
     """What is known of each voxel."""
 
-    sums: f4[:, ::1]  # (R, 10), see WEIGHT, OFFSET, NORMAL, RGB
+    sums: f4[:, ::1]  # (R, 10) of the weights; weighted, of the offset from the voxel's centre [voxels], the normal and the colour
     count: i4[::1]  # (R,) readings
 
 
@@ -149,3 +137,19 @@ def _add_points(points: _Points, T_wc: f8[:, ::1], per_side: f8, index: Index, n
         sums[row, 9] += w * rgb[pixel[i], 2]
         count[row] += 1
     return n_rows
+
+
+@kernel(error_model="numpy")
+def _average(sums: f4[:, ::1], row: i8[::1], key: i8[::1], side: f8, xyz: f4[:, ::1], normal: f4[:, ::1], rgb: u1[:, ::1]):
+    """Fill the position, the unit normal and the colour of the voxels in some rows, whose Morton keys are given."""
+    for i in range(len(row)):
+        of = sums[row[i]]
+        weight = of[0]
+        for k in range(3):
+            xyz[i, k] = (gather(key[i] >> k) - HALF_EXTENT + 0.5 + of[1 + k] / weight) * side
+            rgb[i, k] = np.uint8(min(max(np.rint(of[7 + k] / weight), np.float32(0.0)), np.float32(255.0)))
+        a, b, c = of[4] / weight, of[5] / weight, of[6] / weight
+        length = np.sqrt(a * a + b * b + c * c)
+        if length > 0:
+            a, b, c = a / length, b / length, c / length
+        normal[i, 0], normal[i, 1], normal[i, 2] = a, b, c
