@@ -94,6 +94,7 @@ def main() -> int:
                 steer(known[name], Path(folder))
             attempt(known[name], Path(folder), known[name].seeds[0], bound=contextlib.nullcontext)  # compiles its kernels
             tried = Tally()
+            held = reset_peak()
             for failure in fuzz(known[name], Path(folder), inputs=given.inputs, seed=given.seed, tally=tried):
                 n_failures += 1
                 print(failure.told, file=said, flush=True)
@@ -101,7 +102,8 @@ def main() -> int:
                     given.keep.mkdir(parents=True, exist_ok=True)
                     (given.keep / f"{name}-{failure.number}").write_bytes(failure.data)
             print(
-                f"{name:<20}{tried.read:>8} read {tried.refused:>8} refused {tried.failed:>6} failed   slowest {tried.slowest:.2f} s",
+                f"{name:<22}{tried.read:>8} read {tried.refused:>8} refused {tried.failed:>6} failed"
+                f"   slowest {tried.slowest:.2f} s, together {tried.seconds:.0f} s   at most {(peak() - held) >> 20} MiB more",
                 flush=True,
             )
     return 1 if n_failures else 0
@@ -112,7 +114,7 @@ class Tally:
     """What became of the inputs."""
 
     read = refused = failed = 0
-    slowest = 0.0
+    slowest = seconds = 0.0  # of CPU
 
 
 @dataclass(frozen=True)
@@ -122,6 +124,17 @@ class Failure:
     number: int
     data: bytes
     told: str
+
+
+def reset_peak() -> int:
+    """Forget how much memory this process once held; returns how many bytes it holds."""
+    Path("/proc/self/clear_refs").write_text("5")
+    return peak()
+
+
+def peak() -> int:
+    """Return how many bytes of memory this process held at most."""
+    return 1024 * next(int(line.split()[1]) for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmHWM"))
 
 
 def fuzz(parser: Parser, folder: Path, *, inputs: int, seed: int, tally: Tally) -> Iterator[Failure]:
@@ -136,7 +149,7 @@ def fuzz(parser: Parser, folder: Path, *, inputs: int, seed: int, tally: Tally) 
         took = time.process_time() - started
         if parser.others:
             (folder / name).write_bytes(seeds[0])
-        tally.slowest = max(tally.slowest, took)
+        tally.slowest, tally.seconds = max(tally.slowest, took), tally.seconds + took
         if error is None:
             tally.read += 1
         elif isinstance(error, SlamError):
