@@ -21,6 +21,7 @@ TIMEOUT = 30.0  # [s] without a byte
 ATTEMPTS = 4  # a connection that breaks is taken up again where it stopped
 MAX_ARCHIVE = 16 << 30  # bytes; the largest recording of the set has 6 GB
 MAX_UNPACKED = 32 << 30
+MOST_NAME = 255  # bytes of a member's path
 MAX_MEMBERS = 200_000
 MAX_READ = 64 << 20  # tarfile reads a header's claimed size at once
 
@@ -133,13 +134,15 @@ def _extract(tar: tarfile.TarFile, staging: Path, top: str, progress: Progress) 
             raise SlamError(f"{top}: archive refused: unpacks to more than any recording of the set holds")
         inside = _inside(member, top)
         path = staging.joinpath(*inside.parts)
-        if member.isdir():
-            path.mkdir(parents=True, exist_ok=True)
-            continue
-        path.parent.mkdir(parents=True, exist_ok=True)
-        source = tar.extractfile(member)
-        with path.open("xb") as file:
-            shutil.copyfileobj(source, file, CHUNK)  # type: ignore[arg-type]  # a plain file's is never None
+        try:
+            (path if member.isdir() else path.parent).mkdir(parents=True, exist_ok=True)
+            if member.isdir():
+                continue
+            source = tar.extractfile(member)
+            with path.open("xb") as file:
+                shutil.copyfileobj(source, file, CHUNK)  # type: ignore[arg-type]  # a plain file's is never None
+        except (FileExistsError, NotADirectoryError) as error:
+            raise SlamError(f"archive refused: {member.name!r} is in it twice, or within one of its files") from error
 
 
 def _drain(stream: gzip.GzipFile) -> None:
@@ -156,7 +159,8 @@ def _inside(member: tarfile.TarInfo, top: str) -> PurePosixPath:
     path = PurePosixPath(member.name)
     harmless = not path.is_absolute() and ".." not in path.parts and "\\" not in member.name and ":" not in member.name
     plain = member.type in (tarfile.REGTYPE, tarfile.AREGTYPE, tarfile.DIRTYPE)
-    if not harmless or not plain or path.parts[:1] != (top,):
+    is_short = len(member.name.encode(errors="surrogateescape")) <= MOST_NAME
+    if not harmless or not plain or not is_short or path.parts[:1] != (top,):
         raise SlamError(f"archive refused: {member.name!r} is not a plain file or folder inside {top}")
     return path.relative_to(top)
 

@@ -14,8 +14,8 @@ import numpy as np
 
 from slamcli import files
 from slamcli.datasets import png
-from slamcli.datasets.image_header import JPEG_MAGIC, KINDS, image_size
 from slamcli.errors import BadFrame, SlamError
+from slamcli.formats.image_header import JPEG_MAGIC, KINDS, image_size
 
 MAX_BYTES = 256 << 20  # of one image file
 MAX_PIXELS = 100_000_000  # of one image

@@ -207,6 +207,10 @@ HOSTILE: dict[str, Callable[[], bytes]] = {
     "hard link": lambda: archive((member(f"{NAME}/l", tarfile.LNKTYPE, target="/etc/passwd"), b"")),
     "device": lambda: archive((member(f"{NAME}/d", tarfile.CHRTYPE), b"")),
     "pipe": lambda: archive((member(f"{NAME}/p", tarfile.FIFOTYPE), b"")),
+    "twice": lambda: archive((member(f"{NAME}/a"), b"x"), (member(f"{NAME}/a"), b"y")),
+    "within a file": lambda: archive((member(f"{NAME}/a"), b"x"), (member(f"{NAME}/a/b/c"), b"y")),
+    "a folder in the place of a file": lambda: archive((member(f"{NAME}/a"), b"x"), (member(f"{NAME}/a", tarfile.DIRTYPE), b"")),
+    "long name": lambda: archive((member(f"{NAME}/{'a' * 300}"), b"x")),
     "size": lambda: gzip.compress(member(f"{NAME}/huge", size=1 << 45).tobuf(tarfile.GNU_FORMAT)),
     "header": lambda: gzip.compress(member("x", tarfile.XHDTYPE, size=1 << 40).tobuf(tarfile.GNU_FORMAT)),
 }

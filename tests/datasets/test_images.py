@@ -9,8 +9,8 @@ import pytest
 from recordings import SIZE, colour, depth, png
 
 from slamcli.datasets import images
-from slamcli.datasets.image_header import image_size
 from slamcli.errors import BadFrame
+from slamcli.formats.image_header import image_size
 
 
 def grey(path: Path) -> np.ndarray:

@@ -35,6 +35,10 @@ def png_of(width: int, height: int) -> bytes:
         (picture.BMP_MAGIC + bytes(40), "not a picture"),
         (png_of(100_000, 100_000), "100000 x 100000 pixels are too many"),
         (picture.BMP_MAGIC + bytes(16) + struct.pack("<ii", -100_000, 2**31 - 1) + bytes(30), "too many"),
+        (
+            picture.BMP_MAGIC + bytes(12) + struct.pack("<IHH", 12, 20_000, 20_000) + bytes(30),
+            "20000 x 20000 pixels are too many",
+        ),  # of OS/2
         (picture.encoded(np.zeros((9, 9), np.uint8), ".png")[:40], "not a picture"),
         (picture.BMP_MAGIC + bytes(16) + struct.pack("<ii", 1 << 21, 1) + bytes(30), "not a picture"),
         (png_of(1 << 21, 1), "not a picture|cannot be decoded"),  # wider than OpenCV allows: some versions raise, some return nothing
@@ -45,6 +49,13 @@ def test_what_is_no_picture_gives_one_line(tmp_path: Path, data: bytes, says: st
     with pytest.raises(SlamError, match=says) as caught:
         picture.read_grey(tmp_path / "p.png", max_pixels=1 << 24)
     assert "p.png" in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_a_picture_of_another_size_is_refused_before_it_is_decoded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "p.png").write_bytes(picture.encoded(np.zeros((7, 13), np.uint8), ".png"))
+    monkeypatch.setattr(picture.cv2, "imdecode", None)
+    with pytest.raises(SlamError, match="is 13 x 7 px; it must have 7 x 13 px"):
+        picture.read_grey(tmp_path / "p.png", max_pixels=1 << 24, shape=(13, 7))
 
 
 def test_a_missing_picture_is_named(tmp_path: Path) -> None:

@@ -7,12 +7,12 @@ import numpy as np
 
 from slamcli.datasets import images, png
 from slamcli.datasets.calibration import Calibration
-from slamcli.datasets.image_header import JPEG_MAGIC
 from slamcli.datasets.intrinsics import COEFFICIENTS
 from slamcli.datasets.recorded import Recorded, Stream, truth_of_rows
 from slamcli.datasets.sqlite import Blobs, query
 from slamcli.errors import BadFrame, SlamError
 from slamcli.formats import rvl
+from slamcli.formats.image_header import JPEG_MAGIC
 from slamcli.hints import hint
 
 DEPTH_SCALE = 1000.0
