@@ -1,17 +1,17 @@
 """Records of arrays as folders of `.npy`, one file a field. A record's type is its schema; it is checked at every save and load."""
 
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import Field, fields
+from dataclasses import MISSING, Field, fields
 from pathlib import Path
 from tokenize import TokenError
-from types import TracebackType
+from types import MappingProxyType, TracebackType
 from typing import Any, Generic, TypeVar
 
 import numpy as np
 
-from slamcli import files, mapped_memory
+from slamcli import files, mapped_memory, schema
 from slamcli.errors import SlamError
 from slamcli.hints import hint
 
@@ -31,6 +31,53 @@ def check(value: Any) -> None:
             raise ValueError(f"{name}: dtype {column.dtype} is not {dtype}")
         if len(column.shape) != len(shape) or not all(_fits(n, symbol, bound) for n, symbol in zip(column.shape, shape, strict=True)):
             raise ValueError(f"{name}: shape {column.shape} does not fit {list(shape)} with {bound}")
+
+
+def check_values(value: Any, lengths: Mapping[str, int]) -> None:
+    """Compare each field's values with its declaration; ValueError names the field at fault.
+
+    lengths : what symbols stand for in the other types of the folder; one that neither these nor this type bind is not compared
+    """
+    known = dict(lengths)
+    for spec in fields(value):
+        shape = np.asarray(getattr(value, spec.name)).shape
+        if not (spec.default_factory is not MISSING and shape[0] == 0):  # not one that lacks
+            for n, symbol in zip(shape, spec.metadata["shape"], strict=True):
+                if not _fits(n, symbol, known):
+                    raise ValueError(f"{type(value).__name__}.{spec.name}: shape {shape} does not fit {known} of the files beside it")
+    for spec in fields(value):
+        column = np.asarray(getattr(value, spec.name))
+        if column.size and column.dtype.kind in "iuf" and (fault := _fault(column, spec, known)):
+            raise ValueError(f"{type(value).__name__}.{spec.name}: {fault}")
+
+
+def _fault(column: np.ndarray, spec: Field, lengths: Mapping[str, int]) -> str:
+    """Say what is wrong with the values of a field, or ""."""
+    may_be, is_real = spec.metadata["values"], column.dtype.kind == "f"
+    least, most = np.fmin.reduce(column, axis=None), np.fmax.reduce(column, axis=None)  # NaN, if there is another value, is passed over
+    if may_be.least is not None and least < may_be.least:
+        return f"{least:.9g} is less than {may_be.least:g}"
+    if may_be.most is not None and most > may_be.most:
+        return f"{most:.9g} is more than {may_be.most:g}"
+    if may_be.below in lengths and most >= lengths[may_be.below]:
+        return f"row {most} of {lengths[may_be.below]}"
+    if may_be.delimits and (column[0] != 0 or column[-1] != lengths[may_be.delimits] or (column[1:] < column[:-1]).any()):
+        return f"does not divide {lengths[may_be.delimits]} rows"
+    if is_real and spec.metadata["shape"][-2:] == ("4", "4"):
+        return _not_rigid(column.reshape(-1, 4, 4), may_be_nan=may_be.nan)
+    return "a value is missing" if is_real and not may_be.nan and np.isnan(column).any() else ""
+
+
+def _not_rigid(T: np.ndarray, *, may_be_nan: bool) -> str:
+    """Say what keeps matrices (N, 4, 4) from being rigid motions, or ""."""
+    is_none = np.isnan(T[:, :3]).all(axis=(1, 2))
+    there = T[~is_none]
+    if is_none.any() and not may_be_nan:
+        return "a value is missing"
+    rows = there[:, :3, :3]
+    is_rigid = (np.abs(np.einsum("nij,nkj->nik", rows, rows) - np.eye(3)) < schema.NOT_RIGID).all(axis=(1, 2))
+    is_rigid &= np.isfinite(there[:, :3, 3]).all(axis=1) & (there[:, 3] == np.eye(4)[3]).all(axis=1)
+    return "" if is_rigid.all() else "not a rigid motion"
 
 
 def _fits(n: int, symbol: str, bound: dict[str, int]) -> bool:
@@ -167,18 +214,36 @@ def file_names(cls: type) -> list[str]:
     return [f"{spec.name}.npy" for spec in fields(cls)]
 
 
-def load(cls: type[Record], folder: Path) -> Record:
+def load(cls: type[Record], folder: Path, known: Mapping[str, int] = MappingProxyType({})) -> Record:
     """Read a record that `save` wrote; SlamError when a file is absent, torn, or not what `cls` declares.
 
+    known : what symbols stand for in other folders that are read with this one
     Arrays are mapped, not read. The map is private and writable: kernels then see the same array type as for fresh arrays and are
     compiled once, while a write never reaches the file. Fields that are to be widened are read, where they were saved narrowly.
     """
     try:
         value = cls(**{spec.name: _load_field(spec, Path(folder)) for spec in fields(cls)})  # type: ignore[arg-type]  # mypy has no name for what is a dataclass
         check(value)
+        check_values(value, _joined(known, lengths(folder)))
     except ValueError as error:
         raise SlamError(f"{folder}: not what this version of slamcli writes ({error}); make it anew with: {hint().force()}") from error
     return value
+
+
+def lengths(folder: Path) -> dict[str, int]:
+    """Return what symbols stand for in the types that share a folder, as the files of `schema.LENGTHS` tell."""
+    bound: dict[str, int] = {}
+    for name, symbol in schema.LENGTHS:
+        path = Path(folder) / f"{name}.npy"
+        if path.exists() and (column := _read(path)).ndim:
+            _fits(len(column), symbol, bound)
+    return bound
+
+
+def _joined(known: Mapping[str, int], here: Mapping[str, int]) -> dict[str, int]:
+    if other := [symbol for symbol in here if known.get(symbol, here[symbol]) != here[symbol]]:
+        raise ValueError(f"{other[0]} is {here[other[0]]}, but {known[other[0]]} in what is read with it")
+    return {**known, **here}
 
 
 def adopted(record: Record) -> Record:

@@ -22,7 +22,7 @@ class Ragged:
 
     offset: np.ndarray = array("i8", "F+1", "rows")
     xy: np.ndarray = array("f4", "M 2", "px")
-    depth: np.ndarray = array("f4", "M", "m")
+    depth: np.ndarray = array("f4", "M", "m", values=schema.OR_NAN)
     total: np.ndarray = array("f8", "", "scalar")
     is_found: np.ndarray = array("?", "", "scalar")
 
@@ -83,6 +83,95 @@ def test_what_does_not_fit_the_declaration_is_never_saved(tmp_path: Path, change
     with pytest.raises(ValueError, match=message):
         artifacts.save(dataclasses.replace(ragged(), **change), tmp_path)
     assert not list(tmp_path.iterdir())
+
+
+@dataclass(frozen=True)
+class Bounded:
+    """A type with every kind of bound."""
+
+    stamp: np.ndarray = array("f8", "F", "s", values=schema.STAMP)
+    offset: np.ndarray = array("i8", "F+1", "rows of a frame", values=schema.Values(delimits="M"))
+    octave: np.ndarray = array("u1", "M", "level", values=schema.Values(most=7))
+    depth: np.ndarray = array("f4", "M", "m", values=schema.OR_NAN)
+    frame: np.ndarray = array("i4", "P", "frame", narrow="u1", widen=True, values=schema.Values(below="F"))
+    parent: np.ndarray = array("i4", "P", "frame, -1 = none", values=schema.Values(least=-1, below="F"))
+    landmark: np.ndarray = array("i4", "P", "landmark of another type", values=schema.Values(below="L"))
+    T_wc: np.ndarray = array("f8", "P 4 4", "pose")
+    T_kc: np.ndarray = array("f8", "P 4 4", "pose, NaN = none", values=schema.OR_NAN)
+
+
+@dataclass(frozen=True)
+class Lacking:
+    """A type beside it that may have no rows."""
+
+    lacks: np.ndarray = array("f8", "F 2", "may lack", may_lack=True)
+
+
+def bounded(**change: object) -> Bounded:
+    whole, lost = np.tile(np.eye(4), (2, 1, 1)), np.stack([np.eye(4), np.full((4, 4), np.nan)])
+    value = Bounded(
+        stamp=np.array([1.0, 2.0]), offset=np.array([0, 1, 3]), octave=np.array([0, 7, 0], "u1"), depth=np.array([1, np.nan, 2], "f4"),
+        frame=np.array([0, 1], "i4"), parent=np.array([-1, 1], "i4"), landmark=np.array([0, 4], "i4"), T_wc=whole, T_kc=lost,
+    )  # fmt: skip
+    return dataclasses.replace(value, **change)
+
+
+def write_unchecked(value: Bounded, folder: Path) -> None:
+    for spec in dataclasses.fields(value):
+        np.save(folder / f"{spec.name}.npy", getattr(value, spec.name))
+    np.save(folder / "lm_xyz.npy", np.zeros((5, 3)))  # of another type: there are five landmarks
+
+
+def turned(shear: float) -> np.ndarray:
+    return np.tile(np.array([[1, shear, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]]), (2, 1, 1))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"stamp": np.array([1.0, 1e11])}, r"Bounded.stamp: 1e\+11 is more than 1e\+10"),
+        ({"stamp": np.array([np.nan, 1.0])}, "Bounded.stamp: a value is missing"),
+        ({"offset": np.array([0, 4, 3])}, "Bounded.offset: does not divide 3 rows"),
+        ({"offset": np.array([1, 1, 3])}, "Bounded.offset: does not divide 3 rows"),
+        ({"offset": np.array([0, 1, 4])}, "Bounded.offset: does not divide 3 rows"),
+        ({"offset": np.array([0, -1, 3])}, "Bounded.offset: does not divide 3 rows"),
+        ({"octave": np.array([0, 8, 0], "u1")}, "Bounded.octave: 8 is more than 7"),
+        ({"depth": np.array([1, np.inf, 2], "f4")}, r"Bounded.depth: inf is more than 1e\+09"),
+        ({"depth": np.array([1, -2e9, 2], "f4")}, r"Bounded.depth: -2e\+09 is less than -1e\+09"),
+        ({"frame": np.array([0, 2], "i4")}, "Bounded.frame: row 2 of 2"),
+        ({"frame": np.array([0, -1], "i4")}, "Bounded.frame: -1 is less than 0"),
+        ({"parent": np.array([0, -2], "i4")}, "Bounded.parent: -2 is less than -1"),
+        ({"parent": np.array([0, 2], "i4")}, "Bounded.parent: row 2 of 2"),
+        ({"landmark": np.array([0, 5], "i4")}, "Bounded.landmark: row 5 of 5"),
+        ({"T_wc": np.zeros((2, 4, 4))}, "Bounded.T_wc: not a rigid motion"),
+        ({"T_wc": turned(0.01)}, "Bounded.T_wc: not a rigid motion"),
+        ({"T_wc": np.stack([np.eye(4), np.full((4, 4), np.nan)])}, "Bounded.T_wc: a value is missing"),
+        ({"T_kc": np.stack([np.eye(4), np.diag([np.nan, 1, 1, 1])])}, "Bounded.T_kc: not a rigid motion"),
+    ],
+)
+def test_values_that_no_stage_writes_are_refused(tmp_path: Path, change: dict, message: str) -> None:
+    write_unchecked(bounded(**change), tmp_path)
+    with pytest.raises(SlamError, match=message):
+        artifacts.load(Bounded, tmp_path)
+
+
+def test_values_within_their_bounds_are_read(tmp_path: Path) -> None:
+    write_unchecked(bounded(T_wc=turned(1e-6), landmark=np.array([4, 4], "i4")), tmp_path)
+    assert artifacts.load(Bounded, tmp_path).offset.tolist() == [0, 1, 3]
+
+
+def test_rows_of_what_is_read_with_it_are_compared(tmp_path: Path) -> None:
+    write_unchecked(bounded(), tmp_path)
+    assert artifacts.lengths(tmp_path) == {"F": 2, "M": 3, "L": 5}
+    artifacts.load(Bounded, tmp_path, {"F": 2})
+    for rows in (0, 2):
+        np.save(tmp_path / "lacks.npy", np.zeros((rows, 2)))
+        assert len(artifacts.load(Lacking, tmp_path).lacks) == rows
+    np.save(tmp_path / "lacks.npy", np.zeros((1, 2)))
+    with pytest.raises(SlamError, match=r"Lacking.lacks: shape \(1, 2\) does not fit"):
+        artifacts.load(Lacking, tmp_path)
+    with pytest.raises(SlamError, match="F is 2, but 3 in what is read with it"):
+        artifacts.load(Bounded, tmp_path, {"F": 3})
 
 
 def test_two_types_in_one_folder_must_not_share_a_field(tmp_path: Path) -> None:
@@ -190,7 +279,8 @@ def test_of_what_is_widened_another_type_is_refused(tmp_path: Path) -> None:
 
 
 def test_every_core_type_declares_dtype_shape_and_meaning_of_each_field() -> None:
-    types = [value for value in vars(schema).values() if dataclasses.is_dataclass(value)]
+    types = [value for value in vars(schema).values() if isinstance(value, type) and dataclasses.is_dataclass(value)]
+    types.remove(schema.Values)
     assert len(types) >= 8
     for kind in types:
         for spec in dataclasses.fields(kind):

@@ -40,6 +40,7 @@ __all__ = ["NAMES", "STAGES", "Inputs", "Pipeline", "Settings", "Stage", "Tools"
 Record = TypeVar("Record")
 log = logging.getLogger(__name__)
 
+FEATURES = "extract"  # the stage whose rows those of others number
 MOST_WARNINGS = 100  # kept in a record and shown; the rest are counted
 PACKAGES = {"numpy": "numpy", "numba": "numba", "opencv": "opencv-python-headless", "open3d": "open3d", "scipy": "scipy", "g2o": "g2opy"}
 
@@ -77,8 +78,9 @@ class Inputs:
         """Read a record of arrays that `stage` wrote; nothing may be written to them."""
         from slamcli import artifacts
 
-        names = artifacts.file_names(cls)
-        return artifacts.adopted(artifacts.load(cls, self._run.intact(self._declared(stage), *names)))
+        folder = self._run.intact(self._declared(stage), *artifacts.file_names(cls))
+        features = artifacts.lengths(self._run.path / FEATURES) if FEATURES in self._stage.needs else {}
+        return artifacts.adopted(artifacts.load(cls, folder, features))
 
     def camera(self, stage: str = "extract") -> "Camera":
         """Return the intrinsics that extract used, or those known after optimize or loop."""

@@ -15,7 +15,7 @@ from slamcli.formats.colmap import SparseModel
 from slamcli.geometry import se3
 from slamcli.geometry.camera import Camera
 from slamcli.parallel import ordered_map
-from slamcli.schema import Features, Ground, Map, Tracks, frame_poses
+from slamcli.schema import Features, Ground, Map, Tracks, check_seen_in, frame_poses
 from slamcli.stages.contract import Stored
 
 JPEG_SETTINGS = (cv2.IMWRITE_JPEG_QUALITY, 95)
@@ -50,6 +50,7 @@ def sparse_model(run: Stored, camera: Camera, images: PosedImages, names: list[s
     Landmarks seen in fewer than two of the images are left out: they have no track.
     """
     map_, features = run.load(Map, "loop"), run.load(Features, "extract")
+    check_seen_in(map_, features)
     T_lw = run.load(Ground, "densify").T_lw
     frame = map_.kf_frame[map_.obs_kf]
     at = np.clip(np.searchsorted(images.frame, frame), 0, len(images.frame) - 1)

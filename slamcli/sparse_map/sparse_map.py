@@ -4,7 +4,7 @@ import numpy as np
 
 from slamcli import mapped_memory
 from slamcli.geometry import elementary, se3
-from slamcli.schema import Features, Map
+from slamcli.schema import Features, Map, check_seen_in
 from slamcli.sparse_map import observation_chains
 from slamcli.sparse_map.guided_matching import Landmarks
 from slamcli.sparse_map.observation_chains import Chains, Fates, FeatureColumns, Looks
@@ -196,7 +196,8 @@ class SparseMap:
 
     @classmethod
     def from_map(cls, features: Features, map_: Map) -> "SparseMap":
-        """Rebuild the growing form of a map."""
+        """Rebuild the growing form of a map; SlamError where it rests on other features."""
+        check_seen_in(map_, features)
         self = cls(features)
         n_kf, n_lm = len(map_.kf_frame), len(map_.lm_xyz)
         self.kf.append(n_kf, frame=map_.kf_frame, segment=map_.kf_segment, T_wk=map_.T_wk)
