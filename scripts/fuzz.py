@@ -258,7 +258,7 @@ def parsers() -> dict[str, Parser]:
     camera = Camera(width=8, height=6, fx=8.0, fy=8.0, cx=4.0, cy=3.0)
     tum_list = b"# stamp file\n1.0 rgb/1.png\n2.0 rgb/2.png\n3.5 rgb/3.png\n"
     pairs = b"1.0 rgb/1.png 1.01 depth/1.png\n2.0 rgb/2.png 2.01 depth/2.png\n"
-    closures = Closures(np.zeros((2, 2), np.int32), np.zeros((2, 4, 4)), np.zeros(2, np.int32), np.zeros(2, np.float32))
+    closures = Closures(np.array([[1, 0], [2, 1]], np.int32), np.tile(np.eye(4), (2, 1, 1)), np.zeros(2, np.int32), np.zeros(2, np.float32))
 
     def page(path: Path) -> object:
         if not (path.parent / "map.pgm").exists():
