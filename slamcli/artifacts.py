@@ -63,6 +63,8 @@ def _fault(column: np.ndarray, spec: Field, lengths: Mapping[str, int]) -> str:
         return f"row {most} of {lengths[may_be.below]}"
     if may_be.delimits and (column[0] != 0 or column[-1] != lengths[may_be.delimits] or (column[1:] < column[:-1]).any()):
         return f"does not divide {lengths[may_be.delimits]} rows"
+    if may_be.is_sorted and (column[1:] < column[:-1]).any():
+        return "not in increasing order"
     if is_real and spec.metadata["shape"][-2:] == ("4", "4"):
         return _not_rigid(column.reshape(-1, 4, 4), may_be_nan=may_be.nan)
     return "a value is missing" if is_real and not may_be.nan and np.isnan(column).any() else ""

@@ -39,11 +39,12 @@ class Values:
     most: float | None = None
     below: str = ""  # symbol of a length: the values number such rows, from 0 where `least` says no less
     delimits: str = ""  # symbol of a length: the values begin with 0, never decrease and end with it
+    is_sorted: bool = False  # whether they never decrease
     nan: bool = False  # whether NaN may stand for what is missing; of a (4, 4), else a rigid motion, the first three rows are NaN then
 
 
 ANY, OR_NAN, NATURAL = Values(), Values(nan=True), Values(least=0)
-STAMP, STAMP_OR_NAN = Values(most=LARGEST_STAMP), Values(most=LARGEST_STAMP, nan=True)
+STAMP, STAMP_OR_NAN = Values(most=LARGEST_STAMP, is_sorted=True), Values(most=LARGEST_STAMP, nan=True)
 
 
 def array(
@@ -168,12 +169,12 @@ class Map:
     landmarks of one cannot be compared with those of another. Segment 0 is the one that most frames belong to.
     """
 
-    kf_frame: np.ndarray = array("i4", "K", "frame index, increasing", values=Values(below="F"))
+    kf_frame: np.ndarray = array("i4", "K", "frame index, increasing", values=Values(below="F", is_sorted=True))
     kf_segment: np.ndarray = array("i4", "K", "segment a key frame belongs to", values=Values(below="K"))
     T_wk: np.ndarray = array("f8", "K 4 4", "key frame's camera to its segment's world, the camera of its first frame with a pose")
     lm_xyz: np.ndarray = array("f8", "L 3", "m, world")
     obs_lm: np.ndarray = array(
-        "i4", "O", "sorted by (landmark, key frame), pairs unique", narrow="u2", widen=True, values=Values(below="L")
+        "i4", "O", "sorted by (landmark, key frame), pairs unique", narrow="u2", widen=True, values=Values(below="L", is_sorted=True)
     )
     obs_kf: np.ndarray = array("i4", "O", "row in kf_frame", narrow="u1 u2", widen=True, values=Values(below="K"))
     obs_row: np.ndarray = array("i8", "O", "row in Features", narrow="u4", widen=True, values=Values(below="M"))
@@ -258,7 +259,10 @@ class Recordings:
 
     recording_offset: np.ndarray = array("i8", "D+1", "frames of a recording", values=Values(delimits="F"))
     own_stamp: np.ndarray = array(
-        "f8", "F", "s, of the colour image in its recording; stamps of Features are of one time line for all", values=STAMP
+        "f8",
+        "F",
+        "s, of the colour image in its recording; stamps of Features are of one time line for all",
+        values=Values(most=LARGEST_STAMP),
     )
 
 
@@ -322,8 +326,9 @@ class Trajectory:
 
 
 def check_seen_in(map_: Map, features: Features) -> None:
-    """Raise SlamError where a map does not rest on these features: one of the two was made anew since."""
-    if map_.obs_row.max(initial=-1) >= len(features.octave) or map_.kf_frame.max(initial=-1) >= len(features.stamp):
+    """Raise SlamError where a map does not rest on these features, as one of the two was made anew since, or a landmark on none."""
+    is_seen = len(map_.lm_xyz) == 0 or np.bincount(map_.obs_lm, minlength=len(map_.lm_xyz)).all()
+    if not is_seen or map_.obs_row.max(initial=-1) >= len(features.octave) or map_.kf_frame.max(initial=-1) >= len(features.stamp):
         raise SlamError(f"the map rests on other features than those that extract left; bring it up to date with: {hint().force()}")
 
 

@@ -130,6 +130,7 @@ def turned(shear: float) -> np.ndarray:
     ("change", "message"),
     [
         ({"stamp": np.array([1.0, 1e11])}, r"Bounded.stamp: 1e\+11 is more than 1e\+10"),
+        ({"stamp": np.array([2.0, 1.0])}, "Bounded.stamp: not in increasing order"),
         ({"stamp": np.array([np.nan, 1.0])}, "Bounded.stamp: a value is missing"),
         ({"offset": np.array([0, 4, 3])}, "Bounded.offset: does not divide 3 rows"),
         ({"offset": np.array([1, 1, 3])}, "Bounded.offset: does not divide 3 rows"),
