@@ -61,6 +61,8 @@ def one_round(recording: str, out: Path, data: str) -> dict[str, Any]:
     spent: Counter[str] = Counter()
     timed(spent, "digests of files read", RunDir, "intact")
     timed(spent, "digests of files read", damage, "outputs")
+    timed(spent, "values of arrays read", artifacts, "check_values")
+    timed(spent, "lengths of arrays read beside", artifacts, "lengths")
     timed(spent, "what is stale, sizes of files", RunDir, "states")
     timed(spent, "seals", files, "_closed")
     timed(spent, "seals", damage, "seal")
