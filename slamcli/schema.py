@@ -20,6 +20,7 @@ LARGEST = 1e9  # of any number that declares no other bound: beyond, squares and
 LARGEST_STAMP = 1e10  # [s] since 1970, in the year 2286
 LARGEST_INFORMATION = 1e30  # [1/m^2, 1/rad^2]
 MOST_LEVELS = 16  # of an image pyramid
+MOST_NODES = 1 << 22  # of a vocabulary
 MOST_ROWS = 16384  # and columns of an image
 NOT_RIGID = 1e-3  # how far columns of a rotation may be from orthonormal: files hold them as products that were rounded
 LENGTHS = (
@@ -124,9 +125,9 @@ class Words:
     idf: np.ndarray = array("f4", "W", "inverse document frequency of each word of the vocabulary", values=NATURAL)
     word_offset: np.ndarray = array("i8", "F+1", "feature rows of a frame", values=Values(delimits="M"))
     word: np.ndarray = array("i4", "M", "word of each feature row", narrow="u2", values=Values(below="W"))
-    word_node: np.ndarray = array("i4", "W", "node near the root above each word", narrow="u1 u2", values=NATURAL)
+    word_node: np.ndarray = array("i4", "W", "node near the root above each word", narrow="u1 u2", values=Values(least=0, most=MOST_NODES))
     second_node: np.ndarray = array(
-        "i4", "M", "second node near the root of each feature row, -1 = none", narrow="i1 i2", values=Values(least=-1)
+        "i4", "M", "second node near the root of each feature row, -1 = none", narrow="i1 i2", values=Values(least=-1, most=MOST_NODES)
     )
 
     def node(self, rows: slice | np.ndarray) -> np.ndarray:
@@ -323,6 +324,14 @@ class Trajectory:
 
     stamp: np.ndarray = array("f8", "N", "s, increasing", values=STAMP)
     T_wc: np.ndarray = array("f8", "N 4 4", "camera to world", values=OR_NAN)
+
+
+def check_matches(matches: Matches, features: Features) -> None:
+    """Raise SlamError where matches name a feature that its frame does not have."""
+    has_any = matches.offset[1:] > matches.offset[:-1]
+    most = np.maximum.reduceat(matches.row, matches.offset[:-1][has_any], axis=0) if has_any.any() else np.zeros((0, 2), np.int32)
+    if (most >= np.diff(features.offset)[matches.pair[has_any]]).any():
+        raise SlamError(f"matches are not of the features that extract left; make them anew with: {hint().force()}")
 
 
 def check_seen_in(map_: Map, features: Features) -> None:

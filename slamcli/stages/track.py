@@ -17,6 +17,7 @@ from slamcli.schema import (
     Moving,
     Rests,
     Words,
+    check_matches,
 )
 from slamcli.slam import map_segments, moving_objects, rests
 from slamcli.slam.background_motion import BackgroundMotion
@@ -92,6 +93,7 @@ def _track(inputs: Inputs, moving: Moving, background: np.ndarray | None, cfg: C
     """Track every frame on what does not move; returns also when the camera stood still."""
     features, depth = moving_parts.still(inputs, moving)
     words, matches, camera = inputs.load(Words, "match"), inputs.load(Matches, "match"), inputs.camera()
+    check_matches(matches, features)
     stands_still = rests.find(features, words, matches, camera) if cfg.track.rests else rests.NONE
     recording = TrackingInput(FrameStore(features, camera, cfg.sensor), words, matches, FramePoints(depth, camera, cfg.sensor))
     tracker = Tracker(recording, cfg.track, tools.rng(), motion=KnownMotion(background, stands_still))
