@@ -18,7 +18,10 @@ from slamcli.schema import Features, Words
 from slamcli.slam.background_step import Judgement, StepFinder, is_poor, swerve
 
 SPACING = 0.35  # [s] from anchor to anchor: a walker has gone 0.3 m, ten times the noise of depth at 3 m
-SWERVE_COST, SWERVE_MOST = 0.1, 6.0  # share of the surface that a swerve is worth, and how many of them at most
+SWERVE_COST, SWERVE_MOST = 0.1, 3.0  # share of the surface that a swerve is worth, and how many of them at most
+# The same, once what moves is left out: one abrupt swerve is to cost no less than the two, of 3 each, of a fast turn that ends by and by. Before,
+# a step in which next to nothing but somebody is seen may be wrong, and must not lead those around it astray.
+SWERVE_MOST_LATER = 6.0
 
 
 class BackgroundMotion:
@@ -49,7 +52,7 @@ class BackgroundMotion:
             expected = [_scaled(one.T, 1.0 / scale[k + 1]) for one in steps[k + 1]]
             steps[k] = self._steps.more(anchors[k], anchors[k + 1], steps[k], expected)
         T_wc = np.tile(np.eye(4), (len(self._stamp), 1, 1))
-        for k, T in enumerate(_steadiest(steps, scale), start=1):
+        for k, T in enumerate(_steadiest(steps, scale, most=SWERVE_MOST if before is None else SWERVE_MOST_LATER), start=1):
             T_wc[anchors[k]] = product(T_wc[anchors[k - 1]], se3.inverse(T))
         for k in progress(range(1, len(anchors))):
             for i in range(anchors[k - 1] + 1, anchors[k]):
@@ -76,7 +79,7 @@ class BackgroundMotion:
         reference = first if share < 0.5 else last
         expected = product(se3.inverse(se3.interpolate(T_wc[first], T_wc[last], share)), T_wc[reference])
         judged = self._steps.near(reference, i, expected)
-        best = max(judged, key=lambda one: one.score - _cost(one.T, expected))
+        best = max(judged, key=lambda one: one.score - SWERVE_COST * min(swerve(one.T, expected), SWERVE_MOST))
         T_wc[i] = product(T_wc[reference], se3.inverse(best.T))
 
 
@@ -90,27 +93,21 @@ def _scaled(T: np.ndarray, share: float) -> np.ndarray:
     return se3.exp(share * se3.log(T))
 
 
-def _steadiest(steps: list[list[Judgement]], scale: list[float]) -> list[np.ndarray]:
+def _steadiest(steps: list[list[Judgement]], scale: list[float], *, most: float) -> list[np.ndarray]:
     """Choose one candidate of each step, so that most speaks for all of them together and the motion changes least (R. Bellman, 1957).
 
-    scale : how long each step lasts, in times of the one before
+    scale : how long each step lasts, in times of the one before; most : swerves that a change counts as
     """
     total, came_from = [np.array([one.score for one in candidates]) for candidates in steps], list[np.ndarray]()
     for k in range(1, len(steps)):
-        cost = np.array([[_cost(one.T, _scaled(other.T, scale[k])) for other in steps[k - 1]] for one in steps[k]])
-        through = total[k - 1][None, :] - cost
+        cost = np.array([[min(swerve(one.T, _scaled(other.T, scale[k])), most) for other in steps[k - 1]] for one in steps[k]])
+        through = total[k - 1][None, :] - SWERVE_COST * cost
         came_from.append(through.argmax(axis=1))
         total[k] = total[k] + through.max(axis=1)
     chosen = [int(total[-1].argmax())] if steps else []
     for origin in reversed(came_from):
         chosen.append(int(origin[chosen[-1]]))
     return [candidates[number].T for candidates, number in zip(steps, reversed(chosen), strict=True)]
-
-
-def _cost(T: np.ndarray, expected: np.ndarray) -> float:
-    """Weigh a swerve: with its square up to 1, beyond with its root, so that a turn that ends by and by costs no more than one cut short."""
-    squared = swerve(T, expected)
-    return SWERVE_COST * min(squared if squared < 1.0 else 2.0 * np.sqrt(squared) - 1.0, SWERVE_MOST)
 
 
 def anchor_frames(stamp: np.ndarray, shows_depth: np.ndarray) -> list[int]:
