@@ -11,6 +11,7 @@ from slamcli.dense import occupancy
 from slamcli.errors import BadFrame
 from slamcli.evaluation import grid_truth, run_trajectories, trajectory_error
 from slamcli.formats import octomap
+from slamcli.formats.mask import read_mask
 from slamcli.geometry import se3
 from slamcli.navigation import grid
 from slamcli.runs.run_directory import RunDir
@@ -67,6 +68,16 @@ def grid_score(run: RunDir, *, progress: Progress) -> dict[str, Any]:
             except BadFrame:
                 continue
             if depth is not None:
-                yield grid_truth.exact_points(scene, depth, truth.T_wc[true_row], camera, max_range=settings.max_range)
+                still = without_people(depth, _scene_file(run).parent, float(times.stamp[frames[row]]))
+                yield grid_truth.exact_points(scene, still, truth.T_wc[true_row], camera, max_range=settings.max_range)
 
     return grid_truth.score(cells, scene, T_sl, points(), band=(settings.band_low, settings.band_high)).to_dict()
+
+
+def without_people(depth: np.ndarray, recording: Path, stamp: float) -> np.ndarray:
+    """Remove the people from a depth image (H, W) [m] where a simulated recording shows them in the frame of this stamp [s].
+
+    A foot is so near the floor behind it that its reading would count as of that floor, which it hides.
+    """
+    mask = recording / "moving" / f"{stamp:.6f}.png"
+    return np.where(read_mask(mask, depth.shape), np.float32(np.nan), depth) if mask.is_file() else depth
