@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from slamcli import console
 from slamcli.cli.common import Target, check_ending, json_option, run_option
 
 if TYPE_CHECKING:
@@ -42,7 +43,8 @@ def export_plan(out: Path, run: str | None, wall_height: float, door_width: floa
 
 def _tell(out: Path, plan: FloorPlan, wall_height: float) -> None:
     rooms = plan.rooms.rooms
-    areas = ", ".join(f"{room.area:.1f}" for room in rooms)
-    click.echo(f"{out}: {len(plan.walls)} walls, {len(rooms)} rooms ({areas} m2), {len(plan.rooms.doors)} doors", err=True)
+    walls, n_rooms, doors = console.counts({"walls": len(plan.walls), "rooms": len(rooms), "doors": len(plan.rooms.doors)})
+    areas = f" ({', '.join(f'{room.area:.1f}' for room in rooms)} m2)" if rooms else ""
+    click.echo(f"{out}: {walls}, {n_rooms}{areas}, {doors}", err=True)
     if not plan.walls:
         click.echo(f"Warning: no wall was seen up to {wall_height:g} m: rooms end at all obstacles; try a lower --wall-height", err=True)

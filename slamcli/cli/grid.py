@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -14,6 +14,8 @@ from slamcli.cli.common import Mount, Target, json_option, mount_option, run_opt
 from slamcli.errors import SlamError
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     import numpy as np
 
     from slamcli.runs.run_directory import RunDir
@@ -39,11 +41,17 @@ MOUNT_TILT = 0.15  # [rad], more than a floor's slope or a recording's error
     type=click.Path(path_type=Path, dir_okay=False, exists=True),
     help="Polygons, JSON [[[x, y], ...], ...] in metres, or a PNG of the grid's size, not black where to keep out: also write OUT_keepout.",
 )
+@click.option(
+    "--speed",
+    type=click.Path(path_type=Path, dir_okay=False, exists=True),
+    help="Areas with their percentage of full speed, JSON [[50, [[x, y], ...]], ...], or a PNG of the grid's size, black without a limit, "
+    "else dark for slow: also write OUT_speed.",
+)
 @mount_option
 @json_option
 def export_grid(
     out: Path, run: str | None, png: Path | None, costs: Path | None, reach: float, falloff: float, radius: float | None,
-    keep_out: Path | None, mount: tuple[float, ...] | None, as_json: bool,
+    keep_out: Path | None, speed: Path | None, mount: tuple[float, ...] | None, as_json: bool,
 ) -> None:  # fmt: skip
     """Write the navigation grid OUT (.pgm, .png or .bmp) and its description (.yaml) beside it, for map_server and nav2.
 
@@ -52,7 +60,7 @@ def export_grid(
     \b
       slamcli export-grid map.pgm --png map.png
       slamcli export-grid map.pgm --mount 0.1,0,0.3,0,0.2,0
-      slamcli export-grid map.pgm --costs costs.pgm --keep-out no_go.json
+      slamcli export-grid map.pgm --costs costs.pgm --keep-out no_go.json --speed slow.json
     """
     import numpy as np
 
@@ -81,6 +89,8 @@ def export_grid(
     if keep_out is not None:
         is_kept_out = kept_out(grid, keep_out)
         written = (*written, *write_costs(out.with_name(f"{out.stem}_keepout.pgm"), 100 * is_kept_out.astype(np.int16)))
+    if speed is not None:
+        written = (*written, *write_costs(out.with_name(f"{out.stem}_speed.pgm"), speed_limits(grid, speed)))
     rows, columns = grid.state.shape
     if as_json:
         about = {"out": [str(path) for path in written], "columns": columns, "rows": rows, "resolution": float(grid.resolution)}
@@ -97,11 +107,25 @@ def kept_out(grid: Grid, path: Path) -> np.ndarray:
 
     if path.suffix.lower() != ".json":
         return read_mask(path, grid.state.shape)[::-1]
+    return _from_json(path, partial(cost_layers.inside_polygons, grid), "a list of polygons [[[x, y], ...], ...]")
+
+
+def speed_limits(grid: Grid, path: Path) -> np.ndarray:
+    """Read areas or a drawn picture as percentages of full speed (H, W), 0 = no limit."""
+    from slamcli.formats.mask import read_shades
+    from slamcli.navigation import cost_layers
+
+    if path.suffix.lower() != ".json":
+        return cost_layers.speeds_of_shades(read_shades(path, grid.state.shape)[::-1])
+    return _from_json(path, partial(cost_layers.speed_limits, grid), "a list of percentages and polygons [[50, [[x, y], ...]], ...]")
+
+
+def _from_json(path: Path, make: Callable[[Any], np.ndarray], what: str) -> np.ndarray:
+    """Make cells (H, W) of what a JSON file holds; SlamError, which names the file, where that is not `what`."""
     try:
-        polygons = json.loads(files.read_bytes(path, limit=files.LARGEST_JSON).decode("utf-8"))
-        return cost_layers.inside_polygons(grid, polygons)
+        return make(json.loads(files.read_bytes(path, limit=files.LARGEST_JSON).decode("utf-8")))
     except (ValueError, TypeError, OverflowError, RecursionError) as error:
-        raise SlamError(f"{path}: not a list of polygons [[[x, y], ...], ...]") from error
+        raise SlamError(f"{path}: not {what}") from error
     except SlamError as error:
         raise SlamError(f"{path}: {error}") from error
 

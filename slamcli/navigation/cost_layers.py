@@ -1,4 +1,4 @@
-"""Layers over the grid for nav2: the cost of being near obstacles, and places that a robot is told to keep out of."""
+"""Layers over the grid for nav2: the cost of being near obstacles, and places that a robot is told to keep out of or to pass slowly."""
 
 import numpy as np
 
@@ -9,6 +9,7 @@ from slamcli.schema import Grid
 
 LETHAL, INSCRIBED, NEAREST = 100, 99, 98  # an obstacle; the robot would touch; the cost just beyond, which falls off from there
 UNKNOWN = -1
+NO_LIMIT, FULL_SPEED = 0, 100  # [%] as nav2's speed filter reads a mask
 MAX_CORNERS = 100_000
 
 
@@ -46,6 +47,27 @@ def inside_polygons(grid: Grid, polygons: list[list[list[float]]]) -> np.ndarray
             is_odd[crosses] ^= x[None, :] < at[:, None]
         inside |= is_odd
     return inside
+
+
+def speed_limits(grid: Grid, areas: list[tuple[float, list[list[float]]]]) -> np.ndarray:
+    """Give the cells (H, W) int16 whose centre lies within an area its percentage of full speed, 1 to 100, and all others `NO_LIMIT`.
+
+    areas : percentage and polygon of each, as `inside_polygons` takes it; where several overlap, the slowest counts
+    """
+    limits = np.full(grid.state.shape, FULL_SPEED + 1, dtype=np.int16)
+    for percentage, polygon in areas:
+        value = float(percentage)
+        if isinstance(percentage, bool) or not 1.0 <= value <= FULL_SPEED or value != int(value):
+            raise SlamError(f"a speed is a whole percentage of full speed from 1 to {FULL_SPEED}; {percentage!r} is none")
+        inside = inside_polygons(grid, [polygon])
+        limits[inside] = np.minimum(limits[inside], int(value))
+    return np.where(limits > FULL_SPEED, NO_LIMIT, limits).astype(np.int16)
+
+
+def speeds_of_shades(shades: np.ndarray) -> np.ndarray:
+    """Turn a drawn mask (H, W) uint8 into percentages of full speed (H, W) int16: black `NO_LIMIT`, else from dark, slow, to white, full speed."""
+    percentage = np.maximum(np.rint(shades * (FULL_SPEED / 255.0)), 1.0)
+    return np.where(shades == 0, NO_LIMIT, percentage).astype(np.int16)
 
 
 def reachable(grid: Grid, start: tuple[float, float], *, radius: float, allow_unknown: bool = False) -> np.ndarray:

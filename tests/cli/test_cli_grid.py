@@ -312,6 +312,25 @@ def test_costs_and_keep_out_layers_lie_on_the_grid(slamcli, run, tmp_path):
         assert result.exit_code == 1 and "no.json" in result.stderr
 
 
+def test_a_speed_layer_says_how_fast_a_robot_may_go_where(slamcli, run, tmp_path):
+    """As nav2's speed filter of type 1 reads it with base 0 and multiplier 1: percent of full speed, 0 = no limit."""
+    (tmp_path / "slow.json").write_text("[[40, [[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]]]")
+    result = slamcli("export-grid", tmp_path / "m.pgm", "-r", run, "--speed", tmp_path / "slow.json")
+    assert result.exit_code == 0 and "m_speed.pgm" in result.stderr and "mode: scale" in (tmp_path / "m_speed.yaml").read_text()
+    percent = np.rint((255.0 - grid_map.read_pgm(tmp_path / "m_speed.pgm")[::-1]) / 255.0 * 100.0)
+    assert (percent == 40).sum() == 400 and (percent[10:30, 20:40] == 40).all() and set(np.unique(percent)) == {0, 40}
+    drawn = np.zeros((80, 100), np.uint8)
+    drawn[-30:-10, 20:40] = 102  # row 0 is the largest y
+    cv2.imwrite(str(tmp_path / "slow.png"), drawn)
+    assert slamcli("export-grid", tmp_path / "n.pgm", "-r", run, "--speed", tmp_path / "slow.png").exit_code == 0
+    assert (tmp_path / "n_speed.pgm").read_bytes() == (tmp_path / "m_speed.pgm").read_bytes()
+    for content in ("{", "[[1, 2]]", "5", "[[0, [[0, 0], [1, 1], [0, 1]]]]", f"[[1{'0' * 400}, [[0, 0], [1, 1], [0, 1]]]]", "[" * 10_000):
+        (tmp_path / "slow.json").write_text(content)
+        result = slamcli("export-grid", tmp_path / "x.pgm", "-r", run, "--speed", tmp_path / "slow.json")
+        assert result.exit_code == 1 and "slow.json" in result.stderr
+    assert not (tmp_path / "x_speed.pgm").exists()
+
+
 def test_plan_tells_what_a_robot_can_reach(slamcli, run, tmp_path):
     wide = json.loads(slamcli("plan", "--start", "0,1", "--reachable", "-r", run, "--json", "--radius", 0.2).stdout)
     assert 0.9 * wide["free_m2"] < wide["reachable_m2"] < wide["free_m2"]

@@ -62,6 +62,20 @@ def test_polygons_hold_the_cells_whose_centres_they_hold():
             cost_layers.inside_polygons(made, bad)
 
 
+def test_the_slowest_area_counts_and_black_has_no_limit():
+    made = grid(np.zeros((20, 30), np.int8), origin=(0.0, 0.0))
+    square = [[0.2, 0.2], [0.7, 0.2], [0.7, 0.5], [0.2, 0.5]]
+    limits = cost_layers.speed_limits(made, [(30, square), (60, [[0.0, 0.0], [1.5, 0.0], [1.5, 1.0], [0.0, 1.0]]), (90, square)])
+    assert (limits[4:10, 4:14] == 30).all() and (limits == 60).sum() == limits.size - 60
+    assert (cost_layers.speed_limits(made, [(100, square)]) == np.where(limits == 30, 100, cost_layers.NO_LIMIT)).all()
+    assert (cost_layers.speed_limits(made, []) == cost_layers.NO_LIMIT).all()
+    for bad in (0, 101, -5, 50.5, float("nan"), True):
+        with pytest.raises(SlamError, match="whole percentage"):
+            cost_layers.speed_limits(made, [(bad, square)])
+    shades = np.array([[0, 1, 2, 128, 254, 255]], np.uint8)
+    assert cost_layers.speeds_of_shades(shades).tolist() == [[0, 1, 1, 50, 100, 100]]
+
+
 @pytest.mark.parametrize(("door", "radius", "goes_through"), [(0, 0.05, False), (4, 0.05, True), (4, 0.3, False)])
 def test_a_robot_gets_to_the_other_room_where_the_planner_finds_a_way(door, radius, goes_through):
     made = two_rooms(door)
