@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 import click
 
 from slamcli import console
 from slamcli.cli.common import Target, check_ending, json_option, run_option
-
-if TYPE_CHECKING:
-    from slamcli.navigation.floor_plan import FloorPlan
 
 
 @click.command("export-plan")
@@ -35,16 +32,17 @@ def export_plan(out: Path, run: str | None, wall_height: float, door_width: floa
 
     ending = check_ending(out, *WRITERS)
     plan = api.Run(RunDir.find(run)).floor_plan(wall_height=wall_height, door_width=door_width)
-    WRITERS[ending](out, plan.to_dict())
+    about = plan.to_dict()
+    WRITERS[ending](out, about)
     if as_json:
-        click.echo(json.dumps({"out": str(out), **plan.to_dict()}, indent=1))
-    _tell(out, plan, wall_height)
+        click.echo(json.dumps({"out": str(out), **about}, indent=1))
+    _tell(out, about, wall_height)
 
 
-def _tell(out: Path, plan: FloorPlan, wall_height: float) -> None:
-    rooms = plan.rooms.rooms
-    walls, n_rooms, doors = console.counts({"walls": len(plan.walls), "rooms": len(rooms), "doors": len(plan.rooms.doors)})
-    areas = f" ({', '.join(f'{room.area:.1f}' for room in rooms)} m2)" if rooms else ""
-    click.echo(f"{out}: {walls}, {n_rooms}{areas}, {doors}", err=True)
-    if not plan.walls:
+def _tell(out: Path, about: dict[str, Any], wall_height: float) -> None:
+    """Say what was drawn, with the same rounded areas as in the drawing."""
+    walls, rooms, doors = console.counts({name: len(about[name]) for name in ("walls", "rooms", "doors")})
+    areas = ", ".join(f"{room['area_m2']:.1f}" for room in about["rooms"])
+    click.echo(f"{out}: {walls}, {rooms}{f' ({areas} m2)' if areas else ''}, {doors}", err=True)
+    if not about["walls"]:
         click.echo(f"Warning: no wall was seen up to {wall_height:g} m: rooms end at all obstacles; try a lower --wall-height", err=True)

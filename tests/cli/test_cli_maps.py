@@ -4,6 +4,7 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import cv2
 import numpy as np
@@ -14,6 +15,7 @@ from slamcli.dense.occupancy import OccupancyMap
 from slamcli.formats import cloud, octomap
 from slamcli.geometry import se3
 from slamcli.geometry.octree import prune
+from slamcli.navigation.floor_plan import FloorPlan
 from slamcli.runs.run_directory import RunDir
 from slamcli.schema import Ground
 
@@ -152,8 +154,19 @@ def test_a_floor_plan_is_written_and_told(slamcli: Callable, known: RunDir, tmp_
     assert result.exit_code == 0
     plan = json.loads((tmp_path / "plan.json").read_text())
     assert {"out": str(tmp_path / "plan.json"), **plan} == json.loads(result.stdout) and plan["walls"] == []
-    assert f"0 walls, {len(plan['rooms'])} rooms" in result.stderr and "no wall was seen up to 9 m" in result.stderr
+    assert "0 walls, 0 rooms, 0 doors" in result.stderr and "no wall was seen up to 9 m" in result.stderr
     assert slamcli("export-plan", tmp_path / "plan.png", "-r", known.path).exit_code == 1
+
+
+def test_a_floor_plan_counts_in_words_and_tells_the_areas_that_are_drawn(slamcli: Callable, known: RunDir, tmp_path: Path) -> None:
+    corners = [[0.0, 0.0], [8.0, 0.0], [8.0, 5.0], [0.0, 5.0]]
+    wall = {"from": corners[0], "to": corners[1], "length_m": 8.0, "height_m": 2.1}
+    room = {"room": 1, "area_m2": 39.95, "middle": [4.0, 2.5], "outline": corners}
+    about = {"frame": "level: x, y [m]", "walls": [wall, wall], "rooms": [room], "doors": []}
+    with patch.object(FloorPlan, "to_dict", lambda _: about):
+        told = slamcli("export-plan", tmp_path / "plan.svg", "-r", known.path).stderr
+    area = f"{39.95:.1f}"
+    assert f": 2 walls, 1 room ({area} m2), 0 doors" in told and f"1: {area} m²" in (tmp_path / "plan.svg").read_text()
 
 
 def test_plans_and_films_are_rendered(slamcli: Callable, known: RunDir, tmp_path: Path) -> None:
