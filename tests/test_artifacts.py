@@ -2,7 +2,9 @@
 
 import dataclasses
 import io
+import os
 import pickle
+import time
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,7 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from slamcli import artifacts, schema
+from slamcli import artifacts, files, schema
 from slamcli.errors import SlamError
 from slamcli.schema import array
 
@@ -164,15 +166,32 @@ def test_values_within_their_bounds_are_read(tmp_path: Path) -> None:
 def test_rows_of_what_is_read_with_it_are_compared(tmp_path: Path) -> None:
     write_unchecked(bounded(), tmp_path)
     assert artifacts.lengths(tmp_path) == {"F": 2, "M": 3, "L": 5}
-    artifacts.load(Bounded, tmp_path, {"F": 2})
     for rows in (0, 2):
         np.save(tmp_path / "lacks.npy", np.zeros((rows, 2)))
         assert len(artifacts.load(Lacking, tmp_path).lacks) == rows
     np.save(tmp_path / "lacks.npy", np.zeros((1, 2)))
     with pytest.raises(SlamError, match=r"Lacking.lacks: shape \(1, 2\) does not fit"):
         artifacts.load(Lacking, tmp_path)
-    with pytest.raises(SlamError, match="F is 2, but 3 in what is read with it"):
-        artifacts.load(Bounded, tmp_path, {"F": 3})
+    with pytest.raises(SlamError, match=r"stamp.npy: 2 rows do not fit {'F': 3} of what is read with it"):
+        artifacts.lengths(tmp_path, {"F": 3})
+
+
+def test_values_are_compared_once_for_a_file_that_nobody_wrote_to(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    compared, inner = [], artifacts.check_values
+    monkeypatch.setattr(artifacts, "check_values", lambda value, known: compared.append(known) or inner(value, known))
+    write_unchecked(bounded(), tmp_path)
+    for path in tmp_path.iterdir():
+        os.utime(path, ns=(10**18, 10**18))
+    time.sleep(2 * files.TICK_NS / 1e9)
+    known = artifacts.lengths(tmp_path)
+    for _ in range(2):
+        artifacts.load(Bounded, tmp_path, known)
+    assert compared == [known]
+    with pytest.raises(SlamError, match="row 4 of 1"):  # among fewer
+        artifacts.load(Bounded, tmp_path, {**known, "L": 1})
+    np.save(tmp_path / "landmark.npy", np.array([0, 9], "i4"))
+    with pytest.raises(SlamError, match="row 9 of 5"):
+        artifacts.load(Bounded, tmp_path, known)
 
 
 def test_two_types_in_one_folder_must_not_share_a_field(tmp_path: Path) -> None:

@@ -10,12 +10,13 @@ import struct
 import threading
 import weakref
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
-from slamcli.datasets.sqlite import Connections
+from slamcli.datasets.sqlite import Connections, check_stored
 from slamcli.errors import BadFrame, SlamError
 
 HEAD = 64  # bytes of a message that hold its stamp
@@ -77,7 +78,8 @@ def _bag2(path: Path) -> "Bag2":
     from rosbags.rosbag2 import Reader
 
     reader = Reader(path)
-    reader.open()
+    with _checked_databases():
+        reader.open()
     is_unpacked = False
     try:
         storages = list(getattr(reader.storage, "storages", [reader.storage]))
@@ -96,6 +98,21 @@ def _bag2(path: Path) -> "Bag2":
     if is_unpacked:
         weakref.finalize(bag, reader.close)
     return bag
+
+
+@contextmanager
+def _checked_databases() -> Iterator[None]:
+    """Have each SQLite file that the package opens within the block checked before it is asked anything."""
+    import apsw
+
+    def check(connection: Any) -> None:
+        check_stored(connection.execute, Path(connection.filename))
+
+    apsw.connection_hooks.append(check)
+    try:
+        yield
+    finally:
+        apsw.connection_hooks.remove(check)
 
 
 class _Parts:

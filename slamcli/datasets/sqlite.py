@@ -15,6 +15,10 @@ from slamcli.datasets.images import check_whole
 from slamcli.errors import BadFrame, SlamError
 
 MAX_BLOB = 256 << 20  # bytes of one image
+MADE_UP = (  # what is no table of stored values: reading it computes something, without end if the file was made so
+    "SELECT name FROM sqlite_master WHERE type = 'view' OR sql LIKE 'CREATE VIRTUAL%' "
+    "OR (type = 'table' AND EXISTS (SELECT 1 FROM pragma_table_xinfo(sqlite_master.name) WHERE hidden > 1)) LIMIT 1"
+)
 
 
 def query(path: Path, text: str, *, what: str) -> list[tuple[Any, ...]]:
@@ -24,6 +28,12 @@ def query(path: Path, text: str, *, what: str) -> list[tuple[Any, ...]]:
             return connection.execute(text).fetchall()
     except (sqlite3.Error, UnicodeDecodeError) as error:
         raise SlamError(f"{path}: is not {what}, or is damaged ({error})") from error
+
+
+def check_stored(execute: Callable[[str], Any], path: Path) -> None:
+    """Raise SlamError where a file holds views, generated columns or virtual tables; `execute` runs a query on it and returns its rows."""
+    for (name,) in execute(MADE_UP):
+        raise SlamError(f"{path}: {str(name)[:80]!r} is computed, not stored; no recorder writes that, so it is not read")
 
 
 class Connections:
@@ -89,4 +99,11 @@ class Blobs:
 
 
 def _connect(path: Path) -> sqlite3.Connection:
-    return sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro&immutable=1", uri=True, check_same_thread=False)
+    connection = sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro&immutable=1", uri=True, check_same_thread=False)
+    try:
+        connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_BLOB)
+        check_stored(connection.execute, path)
+    except BaseException:
+        connection.close()
+        raise
+    return connection

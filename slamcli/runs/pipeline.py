@@ -62,6 +62,7 @@ class Inputs:
 
     def __init__(self, stage: Stage, run: RunDir, dataset: Callable[[], "Dataset"]) -> None:
         self._stage, self._run, self._dataset = stage, run, dataset
+        self._lengths: dict[str, dict[str, int]] = {}  # by stage, of its arrays and those of the features with them
 
     def _declared(self, name: str) -> str:
         if name not in self._stage.needs:
@@ -79,8 +80,10 @@ class Inputs:
         from slamcli import artifacts
 
         folder = self._run.intact(self._declared(stage), *artifacts.file_names(cls))
-        features = artifacts.lengths(self._run.path / FEATURES) if FEATURES in self._stage.needs else {}
-        return artifacts.adopted(artifacts.load(cls, folder, features))
+        if stage not in self._lengths:
+            features = artifacts.lengths(self._run.path / FEATURES) if FEATURES in self._stage.needs else {}
+            self._lengths[stage] = artifacts.lengths(folder, features)
+        return artifacts.adopted(artifacts.load(cls, folder, self._lengths[stage]))
 
     def camera(self, stage: str = "extract") -> "Camera":
         """Return the intrinsics that extract used, or those known after optimize or loop."""

@@ -33,7 +33,7 @@ def read(path: Path) -> Recorded:
     """List the nodes that have both images."""
     rows = query(
         path,
-        "SELECT Node.id, stamp, length(Data.image), length(Data.depth), ground_truth_pose FROM Node JOIN Data ON Node.id = Data.id "
+        "SELECT Node.id, stamp, length(Data.image), length(Data.depth), CASE WHEN length(ground_truth_pose) < 256 THEN ground_truth_pose END FROM Node JOIN Data ON Node.id = Data.id "
         "WHERE length(Data.image) > 0 AND length(Data.depth) > 0 ORDER BY Node.id",
         what="an RTAB-Map database",
     )
