@@ -239,8 +239,12 @@ def load(cls: type[Record], folder: Path, known: Mapping[str, int] | None = None
             if all(map(files.is_settled, versions)):
                 _remember(told)
     except ValueError as error:
-        raise SlamError(f"{folder}: not what this version of slamcli writes ({error}); make it anew with: {hint().force()}") from error
+        raise _refusal(folder, error) from error
     return value
+
+
+def _refusal(folder: Path, error: ValueError) -> SlamError:
+    return SlamError(f"{folder}: not what this version of slamcli writes ({error}); make it anew with: {hint().force()}")
 
 
 def lengths(folder: Path, known: Mapping[str, int] = MappingProxyType({})) -> dict[str, int]:
@@ -252,7 +256,10 @@ def lengths(folder: Path, known: Mapping[str, int] = MappingProxyType({})) -> di
     for name, symbol in schema.LENGTHS:
         path = Path(folder) / f"{name}.npy"
         if path.exists():
-            column = _read(path)
+            try:
+                column = _read(path)
+            except ValueError as error:
+                raise _refusal(folder, error) from error
             if column.ndim and not _fits(len(column), symbol, bound):
                 raise SlamError(
                     f"{path}: {len(column)} rows do not fit {bound} of what is read with it; make it anew with: {hint().force()}"

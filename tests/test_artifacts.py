@@ -174,6 +174,9 @@ def test_rows_of_what_is_read_with_it_are_compared(tmp_path: Path) -> None:
         artifacts.load(Lacking, tmp_path)
     with pytest.raises(SlamError, match=r"stamp.npy: 2 rows do not fit {'F': 3} of what is read with it"):
         artifacts.lengths(tmp_path, {"F": 3})
+    (tmp_path / "stamp.npy").write_bytes(hostile("objects", b""))
+    with pytest.raises(SlamError, match=r"not what this version of slamcli writes \(stamp.npy"):
+        artifacts.lengths(tmp_path)
 
 
 def test_values_are_compared_once_for_a_file_that_nobody_wrote_to(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 from slamcli import files
 from slamcli.datasets import png
 from slamcli.errors import BadFrame, SlamError
-from slamcli.formats.image_header import JPEG_MAGIC, KINDS, image_size
+from slamcli.formats.image_header import JPEG_MAGIC, KINDS, image_size, is_whole
 
 MAX_BYTES = 256 << 20  # of one image file
 MAX_PIXELS = 100_000_000  # of one image
@@ -227,7 +227,7 @@ def decode_as_it_is(data: bytes, *, name: str) -> np.ndarray:
 
 
 def _decode(data: bytes, flags: int, name: str, size: tuple[int, int] | None = None) -> np.ndarray:
-    if data.startswith(png.MAGIC) and not png.is_whole(data):
+    if data.startswith(png.MAGIC) and not is_whole(data):
         raise BadFrame(f"{name}: PNG is cut off")
     try:
         image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION)

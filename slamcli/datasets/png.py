@@ -55,15 +55,6 @@ def grey_16(data: bytes, size: tuple[int, int]) -> np.ndarray | None:
     return None if image is None else image.view(">u2").astype(np.uint16)
 
 
-def is_whole(data: bytes) -> bool:
-    """Say whether all chunks lie within a PNG file; OpenCV reserves and clears whatever length a chunk claims, up to 2 GB."""
-    at, name = len(MAGIC), b""
-    while name != b"IEND" and at + CHUNK.size <= len(data):
-        n, name = CHUNK.unpack_from(data, at)
-        at += CHUNK.size + n + CHECKSUM.size
-    return name == b"IEND" and at <= len(data)
-
-
 def _decode(data: bytes, size: tuple[int, int], kind: tuple[int, int]) -> np.ndarray | None:
     """Decode a sound file of this kind and size to the bytes of its rows; None for anything else."""
     rows = _rows(data, size, kind)

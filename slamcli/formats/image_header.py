@@ -16,6 +16,7 @@ JPEG_BARE_MARKERS = frozenset({0x01, *range(0xD0, 0xD9)})  # carry no length
 TIFF_SIDES, TIFF_NUMBERS = {256: 0, 257: 1}, {3: "H", 4: "I"}  # tags of width and length; kinds of number that they may be
 PNM_HEADER = re.compile(rb"P[1-6Ff](?:\s|#[^\n]*\n)+(\d{1,9})(?:\s|#[^\n]*\n)+(\d{1,9})\s")
 PNM_LONGEST = 4096  # bytes of a header with its comments
+PNG_CHUNK = 12  # bytes around a chunk's data: length, kind, checksum
 OLD_BMP = 12  # bytes of the header of OS/2, with shorter numbers
 
 
@@ -28,6 +29,15 @@ def image_size(data: bytes) -> Size | None:
             except (struct.error, IndexError):  # cut off
                 return None
     return None
+
+
+def is_whole(png: bytes) -> bool:
+    """Say whether all chunks lie within a PNG file; OpenCV reserves and clears whatever length a chunk claims, up to 2 GB."""
+    at, name = len(PNG_MAGIC), b""
+    while name != b"IEND" and at + PNG_CHUNK <= len(png):
+        length, name = struct.unpack_from(">I4s", png, at)
+        at += PNG_CHUNK + length
+    return name == b"IEND" and at <= len(png)
 
 
 def _png(data: bytes) -> Size | None:

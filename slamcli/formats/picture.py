@@ -7,7 +7,7 @@ import numpy as np
 
 from slamcli import files
 from slamcli.errors import SlamError
-from slamcli.formats.image_header import PNG_MAGIC, image_size
+from slamcli.formats.image_header import PNG_MAGIC, image_size, is_whole
 
 MAX_BYTES = 64 << 20
 BMP_MAGIC = b"BM"
@@ -19,13 +19,14 @@ def read_grey(path: Path, *, max_pixels: int, shape: tuple[int, int] | None = No
         data = files.read_bytes(path, limit=MAX_BYTES)
     except OSError as error:
         raise SlamError(f"{path}: cannot be read ({error.strerror or error})") from error
+    is_there = is_whole(data) if data.startswith(PNG_MAGIC) else data.startswith(BMP_MAGIC)
     columns, rows = (image_size(data) if data.startswith((PNG_MAGIC, BMP_MAGIC)) else None) or (0, 0)
     if columns * rows > max_pixels:
         raise SlamError(f"{path}: {columns} x {rows} pixels are too many")
     if columns * rows:
         _check_shape((rows, columns), shape, path)
     try:
-        picture = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_GRAYSCALE) if columns * rows else None
+        picture = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_GRAYSCALE) if is_there and columns * rows else None
     except cv2.error as error:
         raise SlamError(f"{path}: cannot be decoded ({error.err})") from error
     if picture is None:

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from slamcli.datasets import images, png
 from slamcli.errors import BadFrame
+from slamcli.formats.image_header import is_whole
 
 FILTERS = range(5)
 
@@ -142,14 +143,14 @@ def test_whatever_is_not_plain_and_sound_is_left_to_opencv(what: str) -> None:
 
 def test_a_chunk_that_claims_more_than_the_file_has_is_refused_before_room_is_made_for_it() -> None:
     image = encoded(colour(4, 5), [0] * 4)
-    assert png.is_whole(image)
+    assert is_whole(image)
     at = image.index(b"IDAT") - 4
     for length in (len(image), 1 << 30, (1 << 32) - 1):
         claimed = image[:at] + struct.pack(">I", length) + image[at + 4 :]
-        assert not png.is_whole(claimed)
+        assert not is_whole(claimed)
         with pytest.raises(BadFrame, match="cut off"):
             images.decode_grey(claimed, (5, 4), name="image.png")
-    assert not png.is_whole(image[:-1])
+    assert not is_whole(image[:-1])
 
 
 def test_another_size_than_asked_for_is_left_to_opencv() -> None:

@@ -26,6 +26,13 @@ def png_of(width: int, height: int) -> bytes:
     return picture.PNG_MAGIC + struct.pack(">I", 13) + header + struct.pack(">I", zlib.crc32(header)) + b"IDAT"
 
 
+def wide_png(width: int) -> bytes:
+    """A picture of one row, whole, with a size other than that of its data."""
+    good = picture.encoded(np.zeros((1, 9), np.uint8), ".png")
+    header = b"IHDR" + struct.pack(">I", width) + good[20:29]
+    return good[:12] + header + struct.pack(">I", zlib.crc32(header)) + good[33:]
+
+
 @pytest.mark.parametrize(
     ("data", "says"),
     [
@@ -41,7 +48,7 @@ def png_of(width: int, height: int) -> bytes:
         ),  # of OS/2
         (picture.encoded(np.zeros((9, 9), np.uint8), ".png")[:40], "not a picture"),
         (picture.BMP_MAGIC + bytes(16) + struct.pack("<ii", 1 << 21, 1) + bytes(30), "not a picture"),
-        (png_of(1 << 21, 1), "not a picture|cannot be decoded"),  # wider than OpenCV allows: some versions raise, some return nothing
+        (wide_png(1 << 21), "not a picture|cannot be decoded"),  # wider than OpenCV allows: some versions raise, some return nothing
     ],
 )
 def test_what_is_no_picture_gives_one_line(tmp_path: Path, data: bytes, says: str) -> None:
@@ -56,6 +63,15 @@ def test_a_picture_of_another_size_is_refused_before_it_is_decoded(tmp_path: Pat
     monkeypatch.setattr(picture.cv2, "imdecode", None)
     with pytest.raises(SlamError, match="is 13 x 7 px; it must have 7 x 13 px"):
         picture.read_grey(tmp_path / "p.png", max_pixels=1 << 24, shape=(13, 7))
+
+
+def test_a_chunk_that_claims_more_than_there_is_reserves_no_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    good = picture.encoded(np.zeros((7, 13), np.uint8), ".png")
+    at = good.index(b"IDAT") - 4
+    (tmp_path / "p.png").write_bytes(good[:at] + struct.pack(">I", 1 << 30) + good[at + 4 :])
+    monkeypatch.setattr(picture.cv2, "imdecode", None)
+    with pytest.raises(SlamError, match="not a picture"):
+        picture.read_grey(tmp_path / "p.png", max_pixels=1 << 24)
 
 
 def test_a_missing_picture_is_named(tmp_path: Path) -> None:
