@@ -18,6 +18,7 @@ from slamcli.hints import hint
 Record = TypeVar("Record")
 
 MOST_REMEMBERED = 256  # records whose values were compared; a run has some thirty, and stages read the large ones in turn
+_counted: dict[tuple[int, ...], int | None] = {}  # rows of arrays, by the versions of their files
 _sound: set[tuple[Any, ...]] = set()  # by the versions of their files and the lengths they were compared with
 
 
@@ -255,16 +256,27 @@ def lengths(folder: Path, known: Mapping[str, int] = MappingProxyType({})) -> di
     bound = dict(known)
     for name, symbol in schema.LENGTHS:
         path = Path(folder) / f"{name}.npy"
-        if path.exists():
-            try:
-                column = _read(path)
-            except ValueError as error:
-                raise _refusal(folder, error) from error
-            if column.ndim and not _fits(len(column), symbol, bound):
-                raise SlamError(
-                    f"{path}: {len(column)} rows do not fit {bound} of what is read with it; make it anew with: {hint().force()}"
-                )
+        n = _rows(path)
+        if n is not None and not _fits(n, symbol, bound):
+            raise SlamError(f"{path}: {n} rows do not fit {bound} of what is read with it; make it anew with: {hint().force()}")
     return bound
+
+
+def _rows(path: Path) -> int | None:
+    """Count the rows of an array; None where there is none. A file that nobody has written to since is not opened again."""
+    version = files.version(path)
+    if not version or version in _counted:
+        return _counted.get(version)
+    try:
+        column = _read(path)
+    except ValueError as error:
+        raise _refusal(path.parent, error) from error
+    n = len(column) if column.ndim else None
+    if files.is_settled(version):
+        if len(_counted) >= MOST_REMEMBERED:
+            _counted.clear()
+        _counted[version] = n
+    return n
 
 
 def _remember(told: tuple[Any, ...]) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from click.testing import Result
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "scripts"))
+sys.path.append(str(Path(__file__).parents[2] / "scripts"))  # last: both have a module `layouts`
 
 import forged
 
