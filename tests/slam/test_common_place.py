@@ -22,8 +22,8 @@ from slamcli.sparse_map.sparse_map import SparseMap
 CORRIDOR = {"alias": "corridor", "seed": 102, "width": 160, "height": 120, "frames": 120, "laps": 1.05}
 
 
-def places(*shares: tuple[int, float]) -> int:
-    """Count places that look different, of so many landmarks that should be seen each, and the shares that were."""
+def places(*shares: tuple[int, float]) -> tuple[int, int]:
+    """Count places, and those that look different, of so many landmarks that should be seen each, and the shares that were."""
     place = np.repeat(np.column_stack([np.arange(len(shares)), np.zeros((len(shares), 2), int)]), [n for n, _ in shares], axis=0)
     is_found = np.concatenate([np.arange(n) < round(share * n) for n, share in shares])
     order = np.random.default_rng(0).permutation(len(place))
@@ -32,16 +32,17 @@ def places(*shares: tuple[int, float]) -> int:
 
 def test_a_place_looks_different_where_far_fewer_landmarks_are_found_than_elsewhere() -> None:
     everywhere = (2000, 0.5)
-    assert places(everywhere, (200, 0.0), (200, 0.05), (200, 0.2)) == 2
-    assert places((2000, 0.25), (200, 0.1)) == 0, "where all is hard to find again, little says less"
-    assert places(everywhere, (LEAST_EXPECTED - 1, 0.0)) == 0
-    assert places(everywhere, (LEAST_EXPECTED, 0.0)) == 1
-    assert count_otherwise(np.zeros((0, 3), int), np.zeros(0, bool)) == 0
+    assert places(everywhere, (200, 0.0), (200, 0.05), (200, 0.2)) == (4, 2)
+    assert places((2000, 0.25), (200, 0.1)) == (2, 0), "where all is hard to find again, little says less"
+    assert places(everywhere, (LEAST_EXPECTED - 1, 0.0)) == (1, 0)
+    assert places(everywhere, (LEAST_EXPECTED, 0.0)) == (2, 1)
+    assert count_otherwise(np.zeros((0, 3), int), np.zeros(0, bool)) == (0, 0)
 
 
-def test_one_place_that_looks_different_is_no_objection_and_two_are() -> None:
-    evidence = [common_place.Comparison(agreement=0.99, n_pairs=20, n_different=0, n_otherwise=n) for n in (0, 1, 2)]
-    assert [bool(one.objection) for one in evidence] == [False, False, True]
+@pytest.mark.parametrize(("n_places", "most"), [(13, 1), (39, 1), (40, 2), (171, 8)])
+def test_one_place_that_looks_different_and_a_few_of_many_are_no_objection_and_more_are(n_places: int, most: int) -> None:
+    evidence = [common_place.Comparison(agreement=0.99, n_pairs=20, n_places=n_places, n_otherwise=n) for n in (0, 1, most, most + 1)]
+    assert [bool(one.objection) for one in evidence] == [False, False, False, True]
 
 
 def different(monkeypatch: pytest.MonkeyPatch, is_alike: list[bool]) -> tuple[common_place.Comparison, int]:
