@@ -2,6 +2,7 @@
 
 import itertools
 import os
+import shlex
 from pathlib import Path
 
 from slamcli.datasets.folder import IMAGE_SUFFIXES
@@ -10,6 +11,7 @@ MOST_FOLDERS = 12  # that are looked into, by name
 MOST_FILES = 10_000  # of a folder that are counted
 PNG, BITS_AT = b"\x89PNG\r\n\x1a\n", 24  # of a PNG: how it begins, and where its header says the bits of a channel
 DEPTH_BITS = 16
+VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".avi")
 
 
 def describe(path: Path) -> str:
@@ -27,7 +29,11 @@ def describe(path: Path) -> str:
     if not told[True]:
         return f"{', '.join(told[False])}, no depth images (PNG of {DEPTH_BITS} bits)"
     if not told[False]:
-        return f"{', '.join(told[True])}, no colour images"
+        video = next((entry.name for entry in sorted(path.iterdir()) if entry.suffix.lower() in VIDEO_SUFFIXES), "")
+        unpack = (
+            f" but the video {video}: write its pictures into rgb/, as with: ffmpeg -i {shlex.quote(video)} rgb/%06d.png" if video else ""
+        )
+        return f"{', '.join(told[True])}, no colour images{unpack}"
     return f"{', '.join(told[False] + told[True])}: name the folders rgb and depth, or list the pairs in associations.txt"
 
 
