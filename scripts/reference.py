@@ -123,9 +123,9 @@ def artefacts_page() -> Iterator[str]:
 
 
 def _records() -> list[type]:
-    """List the records that stages write as arrays; a Trajectory is a text file."""
+    """List the records that stages write as arrays; a Trajectory is a text file, and Values says what arrays may hold."""
     found = [value for value in vars(schema).values() if dataclasses.is_dataclass(value) and isinstance(value, type)]
-    return [record for record in found if record is not schema.Trajectory]
+    return [record for record in found if record not in (schema.Trajectory, schema.Values)]
 
 
 def _sentence(text: str | None) -> str:

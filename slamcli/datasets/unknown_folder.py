@@ -2,7 +2,6 @@
 
 import itertools
 import os
-import shlex
 from pathlib import Path
 
 from slamcli.datasets.folder import IMAGE_SUFFIXES
@@ -30,9 +29,7 @@ def describe(path: Path) -> str:
         return f"{', '.join(told[False])}, no depth images (PNG of {DEPTH_BITS} bits)"
     if not told[False]:
         video = next((entry.name for entry in sorted(path.iterdir()) if entry.suffix.lower() in VIDEO_SUFFIXES), "")
-        unpack = (
-            f" but the video {video}: write its pictures into rgb/, as with: ffmpeg -i {shlex.quote(video)} rgb/%06d.png" if video else ""
-        )
+        unpack = f" but the video {video}: write its pictures into rgb/, as ffmpeg does" if video else ""
         return f"{', '.join(told[True])}, no colour images{unpack}"
     return f"{', '.join(told[False] + told[True])}: name the folders rgb and depth, or list the pairs in associations.txt"
 
