@@ -17,7 +17,7 @@ FORMAT = 9  # of everything a run directory holds; raised whenever an array or a
 
 
 LARGEST = 1e9  # of any number that declares no other bound: beyond, squares and grid cells are no numbers
-LARGEST_STAMP = 1e10  # [s] since 1970, in the year 2286
+LARGEST_STAMP = 1e19  # [s] either way; what a list may hold in any unit
 LARGEST_INFORMATION = 1e30  # [1/m^2, 1/rad^2]
 MOST_LEVELS = 16  # of an image pyramid
 MOST_NODES = 1 << 22  # of a vocabulary
@@ -45,7 +45,8 @@ class Values:
 
 
 ANY, OR_NAN, NATURAL = Values(), Values(nan=True), Values(least=0)
-STAMP, STAMP_OR_NAN = Values(most=LARGEST_STAMP, is_sorted=True), Values(most=LARGEST_STAMP, nan=True)
+STAMP_OR_NAN = Values(least=-LARGEST_STAMP, most=LARGEST_STAMP, nan=True)
+STAMP = replace(STAMP_OR_NAN, nan=False, is_sorted=True)
 
 
 def array(

@@ -14,6 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from slamcli import artifacts, files, schema
+from slamcli.datasets import lists
 from slamcli.errors import SlamError
 from slamcli.schema import array
 
@@ -131,7 +132,7 @@ def turned(shear: float) -> np.ndarray:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"stamp": np.array([1.0, 1e11])}, r"Bounded.stamp: 1e\+11 is more than 1e\+10"),
+        ({"stamp": np.array([1.0, 1e20])}, r"Bounded.stamp: 1e\+20 is more than 1e\+19"),
         ({"stamp": np.array([2.0, 1.0])}, "Bounded.stamp: not in increasing order"),
         ({"stamp": np.array([np.nan, 1.0])}, "Bounded.stamp: a value is missing"),
         ({"offset": np.array([0, 4, 3])}, "Bounded.offset: does not divide 3 rows"),
@@ -161,6 +162,12 @@ def test_values_that_no_stage_writes_are_refused(tmp_path: Path, change: dict, m
 def test_values_within_their_bounds_are_read(tmp_path: Path) -> None:
     write_unchecked(bounded(T_wc=turned(1e-6), landmark=np.array([4, 4], "i4")), tmp_path)
     assert artifacts.load(Bounded, tmp_path).offset.tolist() == [0, 1, 3]
+
+
+@pytest.mark.parametrize("stamp", [[-lists.LARGEST_STAMP, 0.0], [5e10, 5e10 + 0.1], [0.0, lists.LARGEST_STAMP]])
+def test_every_stamp_that_a_recording_may_have_can_be_read_back(tmp_path: Path, stamp: list[float]) -> None:
+    write_unchecked(bounded(stamp=np.array(stamp)), tmp_path)
+    assert artifacts.load(Bounded, tmp_path).stamp.tolist() == stamp
 
 
 def test_rows_of_what_is_read_with_it_are_compared(tmp_path: Path) -> None:
