@@ -19,8 +19,8 @@ from slamcli.slam.background_step import Judgement, StepFinder, is_poor, swerve
 
 SPACING = 0.35  # [s] from anchor to anchor: a walker has gone 0.3 m, ten times the noise of depth at 3 m
 SWERVE_COST, SWERVE_MOST = 0.1, 3.0  # share of the surface that a swerve is worth, and how many of them at most
-# The same, once what moves is left out: one abrupt swerve is to cost no less than the two, of 3 each, of a fast turn that ends by and by. Before,
-# a step in which next to nothing but somebody is seen may be wrong, and must not lead those around it astray.
+# The same, once what moves is left out: one abrupt swerve is to cost no less than the two, of 3 each, of a fast turn that ends by and by. While
+# people are in view, a step that shows next to nothing else may be wrong, and must not lead those around it astray.
 SWERVE_MOST_LATER = 6.0
 
 
