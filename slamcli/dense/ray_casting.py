@@ -138,7 +138,8 @@ def _cast_rays(end: f4[:, ::1], end_cell: i8[:, ::1], scan: _Scan, marks: u1[::1
         _ray_times(rays, origin, scan.resolution)
         _cast_block(rays, start_cell, scan, waiting, n_waiting, marks)
     for axis_c in range(3):
-        _walk_together(start, waiting, axis_c, marks)
+        if n_waiting[axis_c] > 0:
+            _walk_together(start, waiting, axis_c, marks)
 
 
 @kernel(error_model="numpy")
@@ -230,10 +231,10 @@ def _march(start, waiting, axis_c, a_before_c, b_before_c, marks):
     ca, cb, cc = load(waiting.t_cell, row), load(waiting.t_cell, row + 1), load(waiting.t_cell, row + 2)
     sa, sb, sc = load(waiting.step, row), load(waiting.step, row + 1), load(waiting.step, row + 2)
     n, stop = load(waiting.n, axis_c), load(waiting.stop, axis_c)
-    # A ray that has passed its last face stays where it is, and marks the start instead: that is passed by all.
+    # A ray that has passed its last face stays where it is, and marks the start instead: that is passed by every ray that waits.
     start = everywhere(start)
     at, nothing, never, one, done = start, everywhere(np.uint64(0)), everywhere(-np.inf), everywhere(1.0), everywhere(0.0)
-    for _ in range(waiting.n[axis_c].max()):
+    for _ in range(int(waiting.n[axis_c].max())):
         is_on = done < n
         until = where(is_on, tc, never)
         is_a = ta <= until if a_before_c else ta < until

@@ -49,6 +49,15 @@ def test_the_cells_of_a_scan_are_those_of_octomap_whatever_rounding_does(origin:
     assert marked_cells(points, np.array(origin), max_range, 0.05) == expected
 
 
+@pytest.mark.parametrize("max_range", [0.002, np.inf])
+@pytest.mark.parametrize("n", [1, 5])
+def test_rays_that_end_in_the_cell_of_their_origin_pass_none(n: int, max_range: float) -> None:
+    origin, points = np.array([0.02, 0.02, 0.02]), np.full((n, 3), 0.03, dtype=np.float32)
+    found = marked_cells(points, origin, max_range, 0.05)
+    assert found == naive.scan_marks(points, origin, max_range, 0.05)
+    assert list(found.values()) == ([True] if max_range == np.inf else [])
+
+
 def test_a_room_full_of_rays_gives_the_cells_of_octomap() -> None:
     rng = np.random.default_rng(0)
     origin = np.array([0.31, -0.22, 0.13])
